@@ -1,0 +1,1 @@
+"""Dataset tools and their command `cqn-data` (installed as `cqn_data`)."""

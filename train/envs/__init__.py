@@ -1,0 +1,1 @@
+"""Simulated environments, registered for LeRobot (no simulator is imported here)."""
