@@ -1,0 +1,121 @@
+"""All numbers of the algorithm in one typed record, and the published columns of them as named presets."""
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+from .errors import ConfigError, one_of
+
+__all__ = ["PRESETS", "CQNSettings", "resolve"]
+
+
+@dataclass(frozen=True)
+class CQNSettings:
+    """Hyperparameters; the defaults are the paper's RLBench column (table 2) unless a comment says otherwise.
+
+    Raises ConfigError when a value is out of its range.
+    """
+
+    # Observation
+    frame_stack: int = 8  # S; joints and environment state are stacked like the images
+    shift_pixels: int = 4  # random shift, 0 is off
+    brightness: float = 0.0  # factor drawn from 1 +- this
+    contrast: float = 0.0
+    state_bound: float = 2.0  # normalised state is cut here: demonstrations span [-1, 1]
+    # Discretisation
+    levels: int = 3  # L
+    bins: int = 5  # N
+    action_margin: float = 0.0  # widens the action bounds by this share of the range, on each side
+    # Networks
+    encoder_channels: tuple[int, ...] = (32, 64, 128, 256)
+    feature_dim: int = 64
+    hidden_dim: int = 512
+    # Value distribution
+    distributional: bool = True  # False: scalar Q, squared error and margin-only imitation
+    atoms: int = 51  # A
+    v_min: float = -1.0
+    v_max: float = 1.0
+    # Losses
+    rl_loss_scale: float = 0.1  # 0 gives the paper's CBC baseline
+    bc_loss_scale: float = 1.0
+    bc_dominance: bool = True  # False: margin only
+    bc_margin: float = 0.01  # the authors' implementation; the paper gives no number
+    discount: float = 0.99  # the authors' implementation; the paper gives no number
+    n_step: int = 3
+    next_action_from: str = "online"  # the authors' double-Q style; "target" is equation 2 as written
+    # Optimisation
+    lr: float = 5e-5
+    weight_decay: float = 0.1
+    tau: float = 0.02
+    # Acting
+    act_with: str = "target"
+    exploration_noise: float = 0.01
+    random_bin_below: float = 1e-4  # exploring only: a spread of Q under this picks a random bin; 0 is off
+    # Speed
+    channels_last: bool = True
+    bf16: bool = False
+
+    def __post_init__(self) -> None:
+        """Check ranges; every message names the field, the value found and what is allowed."""
+        at_least = {
+            "frame_stack": 1, "levels": 1, "bins": 2, "atoms": 2, "n_step": 1, "feature_dim": 1, "hidden_dim": 1,
+            "shift_pixels": 0, "brightness": 0, "contrast": 0, "action_margin": 0, "rl_loss_scale": 0,
+            "bc_loss_scale": 0, "bc_margin": 0, "exploration_noise": 0, "weight_decay": 0, "random_bin_below": 0,
+        }  # fmt: skip
+        for name, low in at_least.items():
+            if getattr(self, name) < low:
+                raise ConfigError(f"`{name}` must be at least {low}, got {getattr(self, name)}.")
+        for name in ("tau", "discount"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ConfigError(f"`{name}` must be in (0, 1], got {getattr(self, name)}.")
+        if self.lr <= 0:
+            raise ConfigError(f"`lr` must be positive, got {self.lr}.")
+        if self.state_bound < 1:
+            raise ConfigError(f"`state_bound` must be at least 1 (demonstrations span [-1, 1]), got {self.state_bound}.")
+        if self.v_min >= self.v_max:
+            raise ConfigError(f"`v_min` must be below `v_max`, got {self.v_min} and {self.v_max}.")
+        if not self.encoder_channels or min(self.encoder_channels) < 1:
+            raise ConfigError(f"`encoder_channels` must be positive numbers, got {self.encoder_channels}.")
+        for name in ("act_with", "next_action_from"):
+            if getattr(self, name) not in ("online", "target"):
+                raise ConfigError(one_of(f"value of `{name}`", getattr(self, name), ("online", "target")))
+        if self.rl_loss_scale == 0 and self.bc_loss_scale == 0:
+            raise ConfigError("Nothing to learn: `rl_loss_scale` and `bc_loss_scale` are both 0; set one above 0.")
+
+    @property
+    def critic_atoms(self) -> int:
+        """A: outputs of the critic per bin."""
+        return self.atoms if self.distributional else 1
+
+
+_DMC: dict[str, Any] = {
+    # Appendix "DeepMind Control Experiments": value bounds, exploration noise; no demonstrations.
+    "v_min": 0.0, "v_max": 200.0, "exploration_noise": 0.1, "bc_loss_scale": 0.0, "rl_loss_scale": 1.0,
+}  # fmt: skip
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "paper_rlbench": {},
+    # Table 2, real-world column.
+    "paper_real_world": {"frame_stack": 4, "levels": 4, "bins": 3, "brightness": 0.2, "contrast": 0.2},
+    "paper_dmc_state": {**_DMC, "frame_stack": 1},
+    "paper_dmc_pixels": {**_DMC, "frame_stack": 3},
+    # The authors' implementation where it differs from the paper (docs/algorithm.md).
+    "reference_rlbench": {"n_step": 1, "v_min": -2.0, "v_max": 2.0, "action_margin": 0.2},
+    # Ours: joints and object poses, no camera, a laptop. Small network, one frame, larger steps.
+    "laptop_state": {"frame_stack": 1, "hidden_dim": 256, "lr": 3e-4},
+    # Ours: two small cameras on a laptop or one GPU.
+    "laptop_pixels": {"frame_stack": 2, "encoder_channels": (16, 32, 64, 64), "hidden_dim": 256, "lr": 1e-4},
+}
+
+
+def resolve(preset: str, overrides: dict[str, Any]) -> CQNSettings:
+    """Settings of a preset with the given fields replaced; None leaves the preset's value.
+
+    Raises ConfigError for an unknown preset or a value out of range.
+    """
+    if preset not in PRESETS:
+        raise ConfigError(one_of("preset", preset, PRESETS))
+    names = {field.name for field in fields(CQNSettings)}
+    given = {name: value for name, value in overrides.items() if value is not None and name in names}
+    if "encoder_channels" in given:
+        given["encoder_channels"] = tuple(given["encoder_channels"])
+    return replace(CQNSettings(**PRESETS[preset]), **given)
