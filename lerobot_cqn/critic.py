@@ -1,7 +1,6 @@
 """The coarse-to-fine critic: action selection (Algorithm 1) and the loss (Algorithm 2) over all levels."""
 
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
 
 import torch
 import torch.nn.functional as F
@@ -35,11 +34,11 @@ class CQNModel(nn.Module):
         super().__init__()
         self.settings = settings
         stack = settings.frame_stack
-        self.encoders = nn.ModuleList(
-            ViewEncoder(channels * stack, height, width, settings.encoder_channels)
-            for channels, height, width in views.values()
-        )
-        pixel_size = sum(encoder.out_features for encoder in self.encoders)
+        encoders = [
+            ViewEncoder(c * stack, height, width, settings.encoder_channels) for c, height, width in views.values()
+        ]
+        self.encoders = nn.ModuleList(encoders)
+        pixel_size = sum(encoder.out_features for encoder in encoders)
         sizes = (pixel_size, low_dim_size * stack, settings.feature_dim, settings.hidden_dim, dims)
         shape = (settings.levels, settings.bins, settings.critic_atoms)
         self.critic = CoarseToFineNetwork(*sizes, *shape)
@@ -52,7 +51,8 @@ class CQNModel(nn.Module):
         values = support(settings.v_min, settings.v_max, settings.critic_atoms)
         self.register_buffer("support", values, persistent=False)
         if settings.channels_last:
-            self.encoders.to(memory_format=torch.channels_last)
+            for encoder in encoders:
+                encoder.convolutions.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     # -- observation ---------------------------------------------------------------------------------------
 
@@ -82,7 +82,7 @@ class CQNModel(nn.Module):
             projected: Projected = critic.project(*features)
         return projected
 
-    def _autocast(self) -> AbstractContextManager[None]:
+    def _autocast(self) -> torch.autocast:
         return torch.autocast(self.support.device.type, dtype=torch.bfloat16, enabled=self.settings.bf16)
 
     # -- values --------------------------------------------------------------------------------------------
@@ -190,9 +190,7 @@ class CQNModel(nn.Module):
     @torch.no_grad()
     def update_target(self) -> None:
         """Polyak step of the target critic: target <- (1 - tau) * target + tau * online (Algorithm 2, last line)."""
-        torch._foreach_lerp_(
-            list(self.target_critic.parameters()), list(self.critic.parameters()), self.settings.tau
-        )
+        torch._foreach_lerp_(list(self.target_critic.parameters()), list(self.critic.parameters()), self.settings.tau)
 
 
 def _unit(pixels: Tensor) -> Tensor:

@@ -45,7 +45,7 @@ class Learner:
                 "rewards, or lower `--policy.lr`; the last checkpoint is untouched."
             )
         self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
         self.model.update_target()
         return stats

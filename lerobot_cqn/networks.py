@@ -1,6 +1,7 @@
 """Encoders, streams and heads (paper, section 3.2 and table 2). Every size is derived from the features."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -22,12 +23,13 @@ class ViewEncoder(nn.Module):
     def __init__(self, in_channels: int, height: int, width: int, channels: Sequence[int]) -> None:
         super().__init__()
         sizes = [in_channels, *channels]
-        self.convolutions = nn.ModuleList(
-            nn.Conv2d(a, b, KERNEL, STRIDE, PADDING) for a, b in zip(sizes, sizes[1:], strict=False)
-        )
+        self.convolutions = nn.ModuleList(nn.Conv2d(a, b, KERNEL, STRIDE, PADDING) for a, b in pairwise(sizes))
         self.norms = nn.ModuleList(nn.LayerNorm(c, eps=LAYER_NORM_EPS) for c in channels)
         for _ in channels:
-            height, width = (height + 2 * PADDING - KERNEL) // STRIDE + 1, (width + 2 * PADDING - KERNEL) // STRIDE + 1
+            height, width = (
+                (height + 2 * PADDING - KERNEL) // STRIDE + 1,
+                (width + 2 * PADDING - KERNEL) // STRIDE + 1,
+            )
         if min(height, width) < 1:
             raise ConfigError(
                 f"Images are too small for {len(channels)} convolutions of stride {STRIDE}: expected at least "
@@ -52,9 +54,7 @@ class Projected(NamedTuple):
 
 
 def _projection(inputs: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Linear(inputs, outputs, bias=False), nn.LayerNorm(outputs, eps=LAYER_NORM_EPS), nn.Tanh()
-    )
+    return nn.Sequential(nn.Linear(inputs, outputs, bias=False), nn.LayerNorm(outputs, eps=LAYER_NORM_EPS), nn.Tanh())
 
 
 class Stream(nn.Module):
@@ -64,7 +64,14 @@ class Stream(nn.Module):
     """
 
     def __init__(
-        self, pixel_size: int, low_dim_size: int, feature_dim: int, hidden_dim: int, dims: int, levels: int, out: int
+        self,
+        pixel_size: int,
+        low_dim_size: int,
+        feature_dim: int,
+        hidden_dim: int,
+        dims: int,
+        levels: int,
+        out: int,
     ) -> None:
         super().__init__()
         self.pixel_projection = _projection(pixel_size, feature_dim) if pixel_size else None
@@ -96,7 +103,8 @@ class Stream(nn.Module):
         )
         hidden = F.silu(self.first_norm(hidden))
         hidden = F.silu(self.second_norm(self.second(hidden)))
-        return self.head(hidden)
+        out: Tensor = self.head(hidden)
+        return out
 
 
 class CoarseToFineNetwork(nn.Module):
@@ -130,7 +138,8 @@ class CoarseToFineNetwork(nn.Module):
         value = self.value(projected.value, previous, levels).float()
         advantage = advantage.view(batch, count, self.dims, self.bins, self.atoms)
         value = value.view(batch, count, self.dims, 1, self.atoms)
-        return advantage + (value - advantage.mean(-2, keepdim=True))
+        logits: Tensor = advantage + (value - advantage.mean(-2, keepdim=True))
+        return logits
 
 
 def initialise(module: nn.Module) -> None:

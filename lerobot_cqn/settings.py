@@ -70,7 +70,9 @@ class CQNSettings:
         if self.lr <= 0:
             raise ConfigError(f"`lr` must be positive, got {self.lr}.")
         if self.state_bound < 1:
-            raise ConfigError(f"`state_bound` must be at least 1 (demonstrations span [-1, 1]), got {self.state_bound}.")
+            raise ConfigError(
+                f"`state_bound` must be at least 1 (demonstrations span [-1, 1]), got {self.state_bound}."
+            )
         if self.v_min >= self.v_max:
             raise ConfigError(f"`v_min` must be below `v_max`, got {self.v_min} and {self.v_max}.")
         if not self.encoder_channels or min(self.encoder_channels) < 1:

@@ -79,7 +79,14 @@ def golden_model(arrays: Mapping[str, np.ndarray]) -> GoldenModel:
     model = GoldenModel({}, low_dim_size, dims, settings)
     for name, weights in (("critic", online), ("target_critic", network_weights(arrays, "target"))):
         network = CoarseToFineNetwork(
-            pixel_size, low_dim_size, feature_dim, hidden_dim, dims, settings.levels, settings.bins, settings.atoms
+            pixel_size,
+            low_dim_size,
+            feature_dim,
+            hidden_dim,
+            dims,
+            settings.levels,
+            settings.bins,
+            settings.atoms,
         )
         network.load_state_dict(weights)
         setattr(model, name, network)
@@ -183,14 +190,19 @@ def main(argv: list[str]) -> int:
         return 2
     paths = [path for path in sorted(Path(argv[0]).glob("*.npz")) if path.stem.split("_")[0] in CHECKS]
     if not paths:
-        print(f"{argv[0]}: expected npz files named {', '.join(f'{k}_*' for k in CHECKS)}, found none", file=sys.stderr)
+        print(
+            f"{argv[0]}: expected npz files named {', '.join(f'{k}_*' for k in CHECKS)}, found none",
+            file=sys.stderr,
+        )
         return 2
     failed = 0
     for path in paths:
         for deviation in check_file(path):
             failed += not deviation.ok
             verdict = "ok" if deviation.ok else "BEYOND TOLERANCE"
-            print(f"{path.stem:32} {deviation.quantity:26} {deviation.worst:9.2e}  (<= {deviation.tolerance:g}) {verdict}")
+            print(
+                f"{path.stem:32} {deviation.quantity:26} {deviation.worst:9.2e}  (<= {deviation.tolerance:g}) {verdict}"
+            )
     print(f"{len(paths)} files, {failed} quantities beyond tolerance")
     return int(failed > 0)
 
