@@ -1,0 +1,103 @@
+"""Entry point of ``cqn-data``: finds the operation, turns errors into one line and an exit code.
+
+Exit codes: 0 done, 1 unexpected failure, 2 a mistake that can be mended by the caller, 130 interrupted.
+Nothing heavy is imported here, so that ``--help`` answers at once.
+"""
+
+import importlib
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from types import FrameType
+
+from .console import Interrupted, note, quiet, result
+
+__all__ = ["OPERATIONS", "main"]
+
+# Operation -> one line for --help. Each lives in the module of its name and offers help() and main(args).
+OPERATIONS = {
+    "record": "record scripted demonstrations in an environment, as teleoperation would",
+    "filter": "drop the time steps in which nothing moves",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run ``cqn-data OPERATION --name=value ...`` and return the exit code; raises only with ``--debug``.
+
+    Args:
+        argv: arguments after the program name; those of the process by default.
+    """
+    args = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in args
+    args = [a for a in args if a != "--debug"]
+    if not args or args[0] in ("-h", "--help", "help"):
+        result(_overview())
+        return 0
+    name, rest = args[0], args[1:]
+    if not debug:
+        quiet()
+    main_thread = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, _terminate) if main_thread else None
+    try:
+        return _run(name, rest)
+    except KeyboardInterrupt as error:
+        note(str(error) if isinstance(error, Interrupted) else "Interrupted: nothing was written.")
+        return 130
+    except Exception as error:
+        if debug:
+            raise
+        return _explain(name, error)
+    finally:
+        if main_thread:
+            signal.signal(signal.SIGTERM, before)
+
+
+def _run(name: str, args: list[str]) -> int:
+    if name not in OPERATIONS:
+        from lerobot_cqn.errors import ConfigError, one_of
+
+        raise ConfigError(one_of("operation", name, OPERATIONS))
+    module = importlib.import_module(f".{name}", __package__)
+    if "-h" in args or "--help" in args:
+        result(module.help())
+        return 0
+    module.main(args)
+    return 0
+
+
+def _explain(name: str, error: Exception) -> int:
+    from lerobot_cqn.errors import CQNError
+
+    text = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, CQNError):
+        note(f"cqn-data {name}: error: {text}")
+        return 2
+    note(f"cqn-data {name}: unexpected {type(error).__name__}: {text[:300]} (--debug shows where)")
+    return 1
+
+
+def _overview() -> str:
+    width = max(map(len, OPERATIONS))
+    return "\n".join(
+        [
+            "cqn-data: prepare LeRobot datasets for CQN. Sources are never changed; nothing is overwritten.",
+            "",
+            "Usage: cqn-data OPERATION --name=value ...",
+            "",
+            *(f"  {name:<{width}}  {text}" for name, text in OPERATIONS.items()),
+            "",
+            "Example:",
+            "  cqn-data filter --repo_id=local/click --root=data/click --dry_run=true",
+            "",
+            "cqn-data OPERATION --help explains its options.",
+        ]
+    )
+
+
+def _terminate(signum: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,285 @@
+"""Walks every registered task of the simulated station."""
+
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+
+import cqn_train.envs
+from cqn_train.envs.cameras import Cameras
+from cqn_train.envs.registration import gym_id
+from cqn_train.envs.station import CAMERAS, MAX_JOINT_SPEED
+from cqn_train.envs.tasks import TASKS
+from lerobot_cqn.errors import ConfigError, DataError
+
+TASK_NAMES = sorted(TASKS)
+
+
+@pytest.fixture
+def make():
+    opened = []
+
+    def _make(task="click_button", **kwargs):
+        env = gym.make(gym_id(task), **kwargs)
+        opened.append(env)
+        return env
+
+    yield _make
+    for env in opened:
+        env.close()
+
+
+def play(env, operator, seed):
+    """One episode by the operator: (steps, still steps, success, truncated)."""
+    env.reset(seed=seed)
+    operator.reset(seed)
+    steps = still = 0
+    while True:
+        action = operator.act()
+        assert env.action_space.contains(action)
+        still += not action[:6].any()
+        _, reward, terminated, truncated, info = env.step(action)
+        assert info["is_success"] is bool(reward)
+        steps += 1
+        if terminated or truncated:
+            return steps, still, info["is_success"], truncated
+
+
+def same(left, right):
+    return all(
+        same(left[key], right[key]) if isinstance(left[key], dict) else np.array_equal(left[key], right[key])
+        for key in left
+    )
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+@pytest.mark.parametrize("obs_type", ["state", "pixels", "both"])
+def test_observations_fit_the_declared_spaces(make, task, obs_type):
+    env = make(task, obs_type=obs_type, image_size=32)
+    observation, info = env.reset(seed=0, options={"lerobot_new_rollout": True})
+    assert env.observation_space.contains(observation)
+    assert info == {"is_success": False}
+    env.action_space.seed(0)
+    for _ in range(5):
+        observation, reward, terminated, _, info = env.step(env.action_space.sample())
+        assert env.observation_space.contains(observation)
+        assert isinstance(info["is_success"], bool)
+        assert (reward, terminated) == (float(info["is_success"]), info["is_success"])
+    names = env.unwrapped.environment_state_names
+    if "environment_state" in observation:
+        assert observation["environment_state"].shape == (len(names),)
+    assert len(env.unwrapped.state_names) == len(env.unwrapped.action_names) == 7
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_an_episode_is_a_function_of_its_seed(make, task):
+    one, two = make(task), make(task)
+    two.reset(seed=99)
+    two.step(two.action_space.sample())
+    first, second = one.reset(seed=3)[0], two.reset(seed=3)[0]
+    assert same(first, second)
+    one.action_space.seed(1)
+    for _ in range(20):
+        action = one.action_space.sample()
+        first, second = one.step(action)[0], two.step(action)[0]
+        assert same(first, second)
+    # Without a seed the stream goes on: another episode, the same in both.
+    third, fourth = one.reset()[0], two.reset()[0]
+    assert same(third, fourth)
+    assert not np.array_equal(third["agent_pos"], one.reset()[0]["agent_pos"])
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+@pytest.mark.parametrize("fps", [10, 20])
+def test_the_scripted_operator_succeeds(make, task, fps):
+    env = make(task, fps=fps, max_episode_steps=TASKS[task].max_episode_steps * fps // 10)
+    operator = env.unwrapped.scripted_teleoperator()
+    results = [play(env, operator, seed) for seed in range(8)]
+    assert all(success for _, _, success, _ in results)
+    assert max(steps for steps, *_ in results) < TASKS[task].typical_steps * 2 * fps / 10
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_pauses_take_the_share_asked_for(make, task):
+    env = make(task, max_episode_steps=4 * TASKS[task].max_episode_steps)
+    operator = env.unwrapped.scripted_teleoperator(pause_share=0.45)
+    results = [play(env, operator, seed) for seed in range(20)]
+    assert all(success for _, _, success, _ in results)
+    assert np.mean([still / steps for steps, still, *_ in results]) == pytest.approx(0.45, abs=0.08)
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_the_operator_repeats_itself_and_bears_tremor(make, task):
+    env = make(task, max_episode_steps=4 * TASKS[task].max_episode_steps)
+    operator = env.unwrapped.scripted_teleoperator(pause_share=0.3, tremor_rad=0.004)
+    assert play(env, operator, 5) == play(env, operator, 5)
+    assert play(env, operator, 5)[2]
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_the_time_limit_truncates(make, task):
+    env = make(task, max_episode_steps=4)
+    assert env.get_wrapper_attr("_max_episode_steps") == 4
+    env.reset(seed=0)
+    still = np.zeros(7, np.float32)
+    ends = [env.step(still)[2:4] for _ in range(4)]
+    assert ends == [(False, False)] * 3 + [(False, True)]
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_a_still_arm_stays(make, task):
+    env = make(task)
+    start = env.reset(seed=0)[0]["agent_pos"]
+    for _ in range(20):
+        end = env.step(np.zeros(7, np.float32))[0]["agent_pos"]
+    np.testing.assert_allclose(end[:6], start[:6], atol=2e-3)
+
+
+def test_a_button_pushed_by_anything_else_is_no_success(make):
+    station = make().unwrapped
+    station.reset(seed=0)
+    station.arm.data.joint("plunger").qpos[0] = 0.015
+    station.arm.forward()
+    assert not station.station_task.success(station.arm)
+
+
+def test_deltas_are_clipped_and_tracked(make):
+    env = make()
+    joints = env.reset(seed=0)[0]["agent_pos"][:6]
+    for step in range(1, 6):
+        measured = env.step(np.array([50, 0, 0, 0, 0, -50, 0.5], np.float32))[0]["agent_pos"][:6]
+        expected = joints + step * MAX_JOINT_SPEED / 10 * np.array([1, 0, 0, 0, 0, -1])
+        np.testing.assert_allclose(measured, expected, atol=0.02)
+
+
+def test_a_blocked_arm_is_not_pushed_harder_and_harder(make):
+    env = make()
+    env.reset(seed=0)
+    down = np.array([0, 0.1, 0, 0, 0, 0, 1], np.float32)
+    for _ in range(40):
+        observation, *_ = env.step(down)
+    blocked = observation["agent_pos"][1]
+    # The command is at most 0.25 rad ahead, so a few steps back are enough to come free.
+    for _ in range(6):
+        observation, *_ = env.step(-down)
+    assert observation["agent_pos"][1] < blocked - 0.2
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros(6), r"shape \(6,\): expected \(7,\)"),
+        (np.zeros((1, 7)), r"shape \(1, 7\)"),
+        (np.array([0, 0, np.nan, 0, 0, 0, 0]), "not finite at 'elbow.pos'"),
+        (np.array([0, 0, 0, 0, 0, 0, np.inf]), "not finite at 'gripper.pos'"),
+    ],
+)
+def test_wrong_actions_are_refused_in_one_line(make, action, message):
+    env = make()
+    env.reset(seed=0)
+    with pytest.raises(DataError, match=message) as error:
+        env.unwrapped.step(action)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_cameras_show_different_pictures(make, task):
+    env = make(task, obs_type="pixels")
+    pixels = env.reset(seed=0)[0]["pixels"]
+    assert tuple(pixels) == CAMERAS
+    for picture in pixels.values():
+        assert picture.shape == (84, 84, 3)
+        assert picture.mean() > 40
+        assert picture.std() > 15
+    pictures = list(pixels.values())
+    for index, left in enumerate(pictures):
+        for right in pictures[index + 1 :]:
+            assert np.abs(left.astype(int) - right).mean() > 5
+    frame = env.render()
+    assert frame.dtype == np.uint8
+    assert frame.shape == (360, 480, 3)
+    assert frame.mean() > 40
+
+
+def test_the_button_is_seen_wherever_it_stands(make):
+    env = make(obs_type="pixels")
+    for seed in range(10):
+        for name, picture in env.reset(seed=seed)[0]["pixels"].items():
+            red = (picture[..., 0] > 150) & (picture[..., 1] < 80) & (picture[..., 2] < 80)
+            assert red.sum() >= 6, (seed, name)
+
+
+def test_state_mode_opens_no_graphics(make, monkeypatch):
+    def refuse(*_):
+        raise AssertionError
+
+    monkeypatch.setattr(Cameras, "picture", refuse)
+    env = make(obs_type="state")
+    env.reset(seed=0)
+    env.step(np.zeros(7, np.float32))
+
+
+def test_an_oversampled_picture_is_the_mean_of_its_pixels(make):
+    station = make(obs_type="pixels").unwrapped
+    station.reset(seed=0)
+    cameras = Cameras(station.arm.model)
+    fine = cameras.picture(station.arm.data, "overview", 64, 64)
+    coarse = cameras.picture(station.arm.data, "overview", 32, 32, oversample=2)
+    mean = fine.reshape(32, 2, 32, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(coarse, mean, atol=1)
+    cameras.close()
+    cameras.close()
+    assert not cameras.opened
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"task": "click_buton"}, "Did you mean 'click_button'"),
+        ({"obs_type": "pixel"}, "Did you mean 'pixels'"),
+        ({"cameras": ["upper_wirst"]}, "Did you mean 'upper_wrist'"),
+        ({"cameras": [], "obs_type": "both"}, "at least one"),
+        ({"cameras": ["upper_wrist", "upper_wrist"]}, "each once"),
+        ({"image_size": 8}, "16 to 1024"),
+        ({"fps": 7}, "5, 10, 20"),
+        ({"episode_length": 0}, "at least 1"),
+    ],
+)
+def test_wrong_settings_are_refused_in_one_line(settings, message):
+    with pytest.raises(ConfigError, match=message) as error:
+        cqn_train.envs.UR5eStationEnv(**settings)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("wrong", [{"pause_share": 1.0}, {"tremor_rad": -1.0}])
+def test_wrong_operator_settings_are_refused(make, wrong):
+    with pytest.raises(ConfigError, match="expected 0 to"):
+        make().unwrapped.scripted_teleoperator(**wrong)
+
+
+def test_a_fresh_process_imports_no_simulator_explains_its_absence_and_leaves_quietly():
+    code = """
+import sys
+import cqn_train.envs
+import gymnasium
+
+assert "mujoco" not in sys.modules
+name = cqn_train.envs.UR5eStationEnv().gym_id
+sys.modules["mujoco"] = None
+try:
+    gymnasium.make(name)
+except Exception as error:
+    print(type(error).__name__, error)
+del sys.modules["mujoco"]
+env = gymnasium.make(name, obs_type="pixels", cameras=["upper_wrist"])
+env.reset(seed=0)  # and no close
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    assert done.stdout.count("\n") == 1
+    assert done.stdout.startswith("ConfigError")
+    assert "pip install 'lerobot_policy_cqn[sim]'" in done.stdout

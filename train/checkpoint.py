@@ -1,0 +1,118 @@
+"""Checkpoints in LeRobot's layout, written whole or not at all, and everything a resumed run needs.
+
+output_dir/checkpoints/<env step>/pretrained_model/   what lerobot-eval loads
+                                 /training_state/     optimiser, counters, random state, online episodes
+output_dir/checkpoints/last -> <env step>
+"""
+
+import json
+import os
+import random
+import shutil
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lerobot_cqn.errors import DataError
+from lerobot_cqn.learner import Learner
+
+from .agent import Agent
+from .replay import Replay
+
+__all__ = ["Counters", "last_checkpoint", "restore", "save"]
+
+
+@dataclass
+class Counters:
+    """How far a run is."""
+
+    env_steps: int = 0
+    episodes: int = 0
+    updates: int = 0
+    offline_done: bool = False
+    wall_s: float = 0.0
+
+
+def last_checkpoint(output_dir: Path) -> Path:
+    """Folder of the newest checkpoint. Raises DataError when there is none."""
+    last = output_dir / "checkpoints" / "last"
+    if not (last / "training_state").is_dir():
+        raise DataError(
+            f"Nothing to resume in {output_dir}: expected checkpoints/last; leave out --resume to start anew."
+        )
+    return last
+
+
+def save(
+    output_dir: Path,
+    agent: Agent,
+    learner: Learner,
+    replay: Replay,
+    rng: np.random.Generator,
+    counters: Counters,
+    *,
+    first_online: int,
+    tables: dict[str, int],
+    run_config: dict[str, Any],
+) -> Path:
+    """Write a checkpoint and point `last` at it; a kill at any moment leaves the previous one in place."""
+    folder = output_dir / "checkpoints"
+    target = folder / f"{counters.env_steps:06d}"
+    temporary = folder / f".{target.name}.tmp"
+    shutil.rmtree(temporary, ignore_errors=True)
+    model, state = temporary / "pretrained_model", temporary / "training_state"
+    state.mkdir(parents=True)
+    agent.policy.save_pretrained(model)
+    agent.preprocessor.save_pretrained(model)
+    agent.postprocessor.save_pretrained(model)
+    (model / "train_config.json").write_text(json.dumps(run_config, indent=2))
+    torch.save(learner.state_dict(), state / "optimizer.pt")
+    torch.save(torch.get_rng_state(), state / "torch_rng.pt")
+    replay.save(state / "online_episodes.npz", first_online)
+    progress = {"counters": asdict(counters), "tables": tables, "numpy_rng": rng.bit_generator.state}
+    (state / "progress.json").write_text(json.dumps(progress))
+    if target.exists():  # same step again (an interrupt right after a save)
+        old = folder / f".{target.name}.old"
+        shutil.rmtree(old, ignore_errors=True)
+        target.rename(old)
+        temporary.rename(target)
+        shutil.rmtree(old)
+    else:
+        temporary.rename(target)
+    link = folder / ".last.tmp"
+    link.unlink(missing_ok=True)
+    link.symlink_to(target.name)
+    os.replace(link, folder / "last")
+    _forget_old_states(folder, target)
+    return target
+
+
+def restore(
+    checkpoint: Path, learner: Learner, replay: Replay, rng: np.random.Generator
+) -> tuple[Counters, dict[str, int]]:
+    """Optimiser, online episodes and random state; returns counters and table sizes. Weights load with the policy."""
+    state = checkpoint / "training_state"
+    learner.load_state_dict(torch.load(state / "optimizer.pt", weights_only=True))
+    replay.load(state / "online_episodes.npz")
+    progress = json.loads((state / "progress.json").read_text())
+    rng.bit_generator.state = progress["numpy_rng"]
+    torch.set_rng_state(torch.load(state / "torch_rng.pt", weights_only=True))
+    return Counters(**progress["counters"]), progress["tables"]
+
+
+def seed_everything(seed: int) -> np.random.Generator:
+    """Seed Python, NumPy's old generator and torch; return the generator for sampling."""
+    random.seed(seed)
+    np.random.seed(seed)  # some environments draw from it
+    torch.manual_seed(seed)
+    return np.random.default_rng(seed)
+
+
+def _forget_old_states(folder: Path, newest: Path) -> None:
+    """Keep every policy, but optimiser and episodes only of the newest checkpoint."""
+    for other in folder.iterdir():
+        if other.is_dir() and not other.is_symlink() and other.name.isdigit() and other != newest:
+            shutil.rmtree(other / "training_state", ignore_errors=True)

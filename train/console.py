@@ -1,0 +1,75 @@
+"""Progress for a person: a live bar on a terminal, a line now and then in a log."""
+
+import time
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+__all__ = ["ConsoleMonitor"]
+
+LOG_EVERY_S = 15.0
+
+
+class ConsoleMonitor:
+    """Shows phases, ETA and notes. Use as a context manager."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        self.console = console or Console(highlight=False, soft_wrap=True)
+        self._bar = Progress(
+            TextColumn("{task.description:>8}"),
+            BarColumn(bar_width=30),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("eta"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}"),
+            console=self.console,
+            disable=not self.console.is_terminal,
+        )
+        self._task: TaskID | None = None
+        self._name, self._total, self._note = "", 0, ""
+        self._begun, self._first, self._logged = 0.0, 0, 0.0
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def phase(self, name: str, total: int, done: int) -> None:
+        """A phase of `total` units begins, `done` of them already behind."""
+        self._name, self._total, self._first = name, total, done
+        self._begun = self._logged = time.monotonic()
+        if self._task is not None:
+            self._bar.remove_task(self._task)
+            self._task = None
+        if total > done:
+            self._task = self._bar.add_task(name, total=total, completed=done, note="")
+
+    def advance(self, done: int, note: str) -> None:
+        """Progress within the phase; an empty note keeps the last one."""
+        self._note = note or self._note
+        if self._task is not None:
+            self._bar.update(self._task, completed=min(done, self._total), note=self._note)
+        now = time.monotonic()
+        if not self.console.is_terminal and now - self._logged > LOG_EVERY_S:
+            self._logged = now
+            left = (now - self._begun) / max(done - self._first, 1) * max(self._total - done, 0)
+            self.console.print(f"{self._name:>8}  {done}/{self._total}  eta {left:.0f} s  {self._note}")
+
+    def message(self, text: str) -> None:
+        """A line that stays."""
+        self.console.print(text)
