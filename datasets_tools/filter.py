@@ -186,12 +186,16 @@ def _rule(config: FilterConfig, source: "Source") -> "Rule":
 
 
 def _writes_rewards(config: FilterConfig, source: "Source") -> bool:
+    from lerobot_cqn.schema import NEXT_REWARD
+
     from .rewards import REWARD_FEATURES
 
     there = [k for k in REWARD_FEATURES if k in source.features]
     write = config.reward == "last" or (config.reward == "auto" and not there)
     if write and there:
         note(f"The source's {', '.join(there)} are replaced (--reward=last).")
+    if not write and NEXT_REWARD not in source.features:
+        note(f"The source has no {NEXT_REWARD} and none is written; --reward=last would write one.")
     return write
 
 

@@ -26,9 +26,9 @@ def parse[Config](config_class: type[Config], args: Sequence[str]) -> Config:
         ConfigError: unknown flag (with the nearest one), missing required flag, or a value of another type.
     """
     import draccus
-    from draccus.utils import DecodingError
+    from draccus.utils import DecodingError, ParsingError
 
-    from lerobot_cqn.errors import ConfigError, one_of
+    from lerobot_cqn.errors import ConfigError, CQNError, one_of
 
     fields = {f.name: f for f in dataclasses.fields(config_class)}  # type: ignore[arg-type]
     given: list[str] = []
@@ -60,6 +60,11 @@ def parse[Config](config_class: type[Config], args: Sequence[str]) -> Config:
             config: Config = draccus.parse(config_class, args=expanded)
     except DecodingError as error:
         raise ConfigError(f"Bad option value: {' '.join(str(error).split())}") from error
+    except ParsingError as error:
+        cause = error.__cause__ or error.__context__ or error
+        if isinstance(cause, CQNError):  # the class checks its own values and says it best
+            raise cause from None
+        raise ConfigError(f"Bad option value: {' '.join(str(cause).split())}") from error
     except SystemExit as error:
         lines = captured.getvalue().strip().splitlines() or ["unreadable options"]
         raise ConfigError(lines[-1].removeprefix("-: error: ")) from error

@@ -39,7 +39,6 @@ class EvalSettings:
     freq: int = 1000  # environment steps between evaluations; 0: only after the offline phase and at the end
     n_episodes: int = 20
     final_n_episodes: int = 50
-    film: int = 0  # episodes of the final evaluation to keep as pictures (eval_film.npz)
 
 
 @dataclass

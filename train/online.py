@@ -136,13 +136,12 @@ class Trainer:
 
     def evaluate(self, phase: str, episodes: int) -> None:
         """Success rate of the deterministic policy; its random state is kept apart from training's."""
-        film = self.config.eval.film if phase == "final" else 0
 
         def look(_: int) -> None:
             if self.should_stop():
                 raise Interrupted
 
-        result = evaluate(self.agent, self.env, episodes, on_episode=look, film=film)
+        result = evaluate(self.agent, self.env, episodes, on_episode=look)
         self.evaluations.append((phase, result))
         low, high = result.interval
         row = {

@@ -1,0 +1,46 @@
+# Every target makes .venv ready first (.ci/setup.sh): nothing needs to be installed or activated by hand.
+SHELL := /bin/bash
+RUN := ./.ci/setup.sh
+WORKERS ?= 2# test processes at a time; one thread each
+ARGS ?=# handed on to the target's command, e.g. make test ARGS='-k losses'
+
+export HF_HUB_OFFLINE ?= 1
+test slow: export OMP_NUM_THREADS = 1
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test slow check format setup pins clean distclean
+
+help: ## show the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+demo: ## see it work: a small training run with its report, in outputs/demo
+	@$(RUN) .venv/bin/python -m cqn_train.demo --output_dir=outputs/demo $(ARGS)
+
+test: ## the fast tests
+	@$(RUN) .venv/bin/python -m pytest -n $(WORKERS) --dist loadgroup $(ARGS)
+
+slow: ## the tests that train for minutes
+	@$(RUN) .venv/bin/python -m pytest -m slow -n $(WORKERS) --dist loadgroup --timeout 3600 $(ARGS)
+
+check: ## lint, formatting, types, import rules
+	@$(RUN) .venv/bin/python -m ruff check .
+	@$(RUN) .venv/bin/python -m ruff format --check .
+	@$(RUN) .venv/bin/python -m mypy
+	@$(RUN) .venv/bin/python -m pytest tests/architecture $(ARGS)
+
+format: ## sort imports, fix what can be fixed, format
+	@$(RUN) .venv/bin/python -m ruff check --fix .
+	@$(RUN) .venv/bin/python -m ruff format .
+
+setup: ## only make .venv ready
+	@$(RUN)
+
+pins: ## refresh constraints.txt to the newest versions that fit pyproject.toml
+	@$(RUN) bash .ci/pins.sh
+
+clean: ## remove caches and build leftovers
+	rm -rf build dist ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -not -path './.venv/*' -not -path './.git/*' -prune -exec rm -rf {} +
+
+distclean: clean ## remove .venv as well
+	rm -rf .venv

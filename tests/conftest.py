@@ -1,0 +1,42 @@
+"""Surroundings of every test: offline, one thread per process, no access to the user's own datasets.
+
+All are environment variables, set before torch, LeRobot or MuJoCo is imported: these read them once.
+"""
+
+import ctypes
+import os
+import shutil
+import sys
+import tempfile
+
+import pytest
+
+_WORKER = "PYTEST_XDIST_WORKER" in os.environ  # a worker inherits the folder of the process that started it
+_HOME = os.environ["HF_HOME"] if _WORKER else tempfile.mkdtemp(prefix="cqn-tests-")
+
+os.environ.update(
+    HF_HUB_OFFLINE="1",
+    HF_HOME=_HOME,
+    HF_LEROBOT_HOME=os.path.join(_HOME, "lerobot"),
+    OMP_NUM_THREADS="1",
+    MKL_NUM_THREADS="1",
+)
+
+
+def _has_library(name: str) -> bool:
+    try:
+        ctypes.CDLL(name)
+    except OSError:
+        return False
+    return True
+
+
+if sys.platform == "linux" and not os.environ.get("DISPLAY") and not os.environ.get("MUJOCO_GL"):
+    only_software = _has_library("libOSMesa.so.8") and not _has_library("libEGL.so.1")
+    os.environ["MUJOCO_GL"] = "osmesa" if only_software else "egl"
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Remove the folder that stood in for the user's."""
+    if not _WORKER:
+        shutil.rmtree(_HOME, ignore_errors=True)

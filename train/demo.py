@@ -1,0 +1,229 @@
+"""`make demo`: paused demonstrations -> pause filter -> CQN offline -> CQN online, with and without the filter.
+
+Runs the same commands a user would type, two trainings at a time on one thread each, and draws a report.
+Interrupted at any moment, it continues where it was when started again.
+"""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import draccus
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from lerobot_cqn.errors import CQNError
+
+__all__ = ["DemoConfig", "main", "run_demo"]
+
+VARIANTS = {"filtered": "pauses dropped", "unfiltered": "pauses kept"}
+ENV = ("--env.type=ur5e_station", "--env.task=click_button")
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """Size of the demo; the defaults fit 2 CPU cores and 10 minutes."""
+
+    output_dir: Path = Path("outputs/demo")
+    demonstrations: int = 30
+    pause_share: float = 0.45
+    seed: int = 0
+    offline_updates: int = 1000
+    steps: int = 3000
+    eval_freq: int = 600
+    eval_episodes: int = 20
+    final_episodes: int = 50
+    expert_episodes: int = 50
+
+
+class DemoError(CQNError):
+    """A command of the demo failed; the message names its log."""
+
+
+class Stages:
+    """Runs commands with their output in a log, one line on the terminal each, skipping what is done."""
+
+    def __init__(self, config: DemoConfig, console: Console) -> None:
+        self.config, self.console = config, console
+        self.logs = config.output_dir / "logs"
+        self.logs.mkdir(parents=True, exist_ok=True)
+        self.environment = os.environ | {
+            "HF_HUB_OFFLINE": "1",
+            "OMP_NUM_THREADS": "1",
+            "TOKENIZERS_PARALLELISM": "false",
+        }
+
+    def start(self, name: str, module: str, *arguments: str) -> subprocess.Popen[bytes]:
+        """Start `python -m module arguments` with its output in logs/name.log."""
+        with (self.logs / f"{name}.log").open("ab") as log:
+            return subprocess.Popen(
+                [sys.executable, "-m", module, *arguments], stdout=log, stderr=subprocess.STDOUT, env=self.environment
+            )
+
+    def check(self, name: str, code: int) -> None:
+        """Raise DemoError with the last line of the log when a command failed."""
+        if code:
+            log = self.logs / f"{name}.log"
+            lines = log.read_text(errors="replace").strip().splitlines() or ["no output"]
+            raise DemoError(f"'{name}' failed with exit code {code}: {lines[-1]} (all of it in {log})")
+
+    def run(self, name: str, text: str, done: Path, module: str, *arguments: str) -> None:
+        """Run a command unless `done` exists."""
+        begun = time.monotonic()
+        if done.exists():
+            self.console.print(f"  {text:<58} already done")
+            return
+        with self.console.status(f"  {text}"):
+            self.check(name, self.start(name, module, *arguments).wait())
+        self.console.print(f"  {text:<58} {time.monotonic() - begun:5.0f} s")
+
+
+def run_demo(config: DemoConfig, console: Console) -> dict[str, Any]:
+    """Everything, in order; returns what `summary.json` holds. Raises DemoError when a command fails."""
+    from .report import write_report
+
+    begun = time.monotonic()
+    stages = Stages(config, console)
+    data = {name: config.output_dir / "data" / name for name in VARIANTS}
+    report = config.output_dir / "dropped.json"
+    stages.run(
+        "record", f"recording {config.demonstrations} demonstrations, {config.pause_share:.0%} pauses",
+        data["unfiltered"] / "meta" / "info.json", "cqn_data.cli", "record", *ENV, "--repo_id=demo/unfiltered",
+        f"--root={data['unfiltered']}", f"--episodes={config.demonstrations}", f"--pause_share={config.pause_share}",
+        f"--seed={config.seed}",
+    )  # fmt: skip
+    stages.run(
+        "filter", "dropping the pauses", data["filtered"] / "meta" / "info.json", "cqn_data.cli", "filter",
+        "--repo_id=demo/unfiltered", f"--root={data['unfiltered']}", "--new_repo_id=demo/filtered",
+        f"--new_root={data['filtered']}", f"--report={report}",
+    )  # fmt: skip
+    train(stages, data)
+    with console.status("  drawing the report"):
+        return write_report(config, VARIANTS, time.monotonic() - begun)
+
+
+def train(stages: Stages, data: dict[str, Path]) -> None:
+    """Train both variants side by side, with one progress bar each."""
+    config = stages.config
+    running: dict[str, subprocess.Popen[bytes]] = {}
+    for name in VARIANTS:
+        run = config.output_dir / name
+        if _finished(run):
+            continue
+        if (run / "checkpoints" / "last").exists():
+            arguments = ["--resume=true", f"--output_dir={run}"]
+        else:
+            arguments = [
+                "--policy.type=cqn", "--policy.preset=laptop_state", "--policy.device=cpu", *ENV,
+                f"--dataset.repo_id=demo/{name}", f"--dataset.root={data[name]}", f"--output_dir={_fresh(run)}",
+                f"--seed={config.seed}", f"--offline_updates={config.offline_updates}", f"--steps={config.steps}",
+                f"--eval.freq={config.eval_freq}", f"--eval.n_episodes={config.eval_episodes}",
+                f"--eval.final_n_episodes={config.final_episodes}", "--save_freq=1000", "--threads=1",
+            ]  # fmt: skip
+        running[name] = stages.start(name, "cqn_train.cli", *arguments)
+    total = config.offline_updates + config.steps
+    columns = (TextColumn("  {task.description:<26}"), BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("eta"),
+               TimeRemainingColumn(), TextColumn("{task.fields[note]}"))  # fmt: skip
+    with Progress(*columns, console=stages.console) as bars:
+        tasks: dict[str, TaskID] = {
+            name: bars.add_task(f"training, {VARIANTS[name]}", total=total, note="") for name in running
+        }
+        try:
+            while any(process.poll() is None for process in running.values()):
+                for name, task in tasks.items():
+                    done, note = _progress(config.output_dir / name, config)
+                    bars.update(task, completed=done, note=note)
+                time.sleep(1.0)
+        except KeyboardInterrupt:
+            for process in running.values():  # they have received the signal too, and are saving
+                process.wait()
+            raise
+    for name, process in running.items():
+        stages.check(name, process.returncode)
+
+
+def _finished(run: Path) -> bool:
+    return any(row["phase"] == "final" for row in read_rows(run / "evaluations.csv"))
+
+
+def _fresh(run: Path) -> Path:
+    """Move a run that died before its first checkpoint out of the way."""
+    if run.exists():
+        run.rename(run.with_name(f"{run.name}-unfinished-{int(time.time())}"))
+    return run
+
+
+def _progress(run: Path, config: DemoConfig) -> tuple[int, str]:
+    updates, evaluations = read_rows(run / "updates.csv"), read_rows(run / "evaluations.csv")
+    if not updates:
+        return 0, "loading"
+    offline = min(int(updates[-1]["updates"]), config.offline_updates)
+    note = f"success {float(evaluations[-1]['success_rate']):.2f}" if evaluations else "offline"
+    return offline + int(updates[-1]["env_steps"]), note
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV table; none while it does not exist."""
+    if not path.exists():
+        return []
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def show(summary: dict[str, Any], config: DemoConfig, console: Console) -> None:
+    """The short table at the end."""
+    table = Table(title="click_button, success over evaluation episodes", title_justify="left")
+    for column in ("demonstrations", "steps", "after offline", "after online", "95 % interval"):
+        table.add_column(column, justify="left" if column == "demonstrations" else "right")
+    expert = summary["expert"]
+    table.add_row("scripted expert", "", "", _rate(expert), _interval(expert))
+    for name, text in VARIANTS.items():
+        variant = summary["variants"][name]
+        table.add_row(
+            text, str(variant["steps_in_dataset"]), _rate(variant["offline"]), _rate(variant["online"]),
+            _interval(variant["online"]),
+        )  # fmt: skip
+    console.print(table)
+    console.print(f"report   {config.output_dir / 'report.html'}\nsummary  {config.output_dir / 'summary.json'}")
+    console.print(f"policy   {config.output_dir / 'filtered' / 'checkpoints' / 'last' / 'pretrained_model'}")
+
+
+def _rate(result: dict[str, Any]) -> str:
+    return f"{result['success_rate']:.2f} ({result['successes']}/{result['n']})"
+
+
+def _interval(result: dict[str, Any]) -> str:
+    return f"{result['ci_low']:.2f} - {result['ci_high']:.2f}"
+
+
+def main() -> int:
+    """Entry of `python -m cqn_train.demo`."""
+    console = Console(highlight=False)
+    try:
+        config = draccus.parse(DemoConfig)
+        finished = config.output_dir / "summary.json"
+        if finished.exists():
+            console.print(f"Already done; delete {config.output_dir} to run it again.")
+            summary = json.loads(finished.read_text())
+        else:
+            console.print("CQN demo: paused demonstrations -> filter -> offline -> online, about 8 minutes on 2 cores.")
+            summary = run_demo(config, console)
+        show(summary, config, console)
+    except KeyboardInterrupt:
+        console.print("Stopped; start it again to continue.")
+        return 130
+    except CQNError as error:
+        console.print(f"demo: {error}", style="red")
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,89 @@
+"""Pictures of a run, as PNG bytes; matplotlib is imported on use (extra `report`)."""
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from lerobot_cqn.errors import ConfigError
+
+__all__ = ["animation", "curves", "dropped_steps", "film_strip"]
+
+COLOURS = {"filtered": "#1f77b4", "unfiltered": "#d95f02"}
+KEPT, DROPPED = "#1f77b4", "#d9d9d9"
+
+Rows = Sequence[Mapping[str, str]]
+
+
+def _pyplot() -> Any:
+    try:
+        import matplotlib as mpl
+    except ImportError as error:
+        raise ConfigError("Reports need the extra: pip install 'lerobot_policy_cqn[report]'.") from error
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    plt.rcParams.update({"font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "figure.dpi": 120})
+    return plt
+
+
+def _png(figure: Any) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", bbox_inches="tight")
+    _pyplot().close(figure)
+    return buffer.getvalue()
+
+
+def curves(evaluations: Mapping[str, Rows], labels: Mapping[str, str], expert: float) -> bytes:
+    """Success rate over environment steps with its 95 % interval, one line per variant."""
+    figure, axes = _pyplot().subplots(figsize=(7.2, 3.4))
+    for name, rows in evaluations.items():
+        steps = [int(row["env_steps"]) for row in rows]
+        rate = [float(row["success_rate"]) for row in rows]
+        low, high = [float(r["ci_low"]) for r in rows], [float(r["ci_high"]) for r in rows]
+        axes.plot(steps, rate, marker="o", markersize=4, color=COLOURS[name], label=labels[name])
+        axes.fill_between(steps, low, high, color=COLOURS[name], alpha=0.15, linewidth=0)
+    axes.axhline(expert, color="0.5", linestyle=":", linewidth=1, label="scripted expert")
+    axes.set(xlabel="environment steps (0 is after offline training)", ylabel="success rate", ylim=(-0.03, 1.04))
+    axes.legend(loc="center right", frameon=False)
+    return _png(figure)
+
+
+def dropped_steps(episodes: Sequence[Mapping[str, Any]]) -> bytes:
+    """What the filter dropped: one bar per episode along its time steps, pauses in grey."""
+    plt = _pyplot()
+    figure, axes = plt.subplots(figsize=(7.2, 0.11 * len(episodes) + 0.9))
+    for row, episode in enumerate(episodes):
+        axes.barh(row, episode["steps"], color=KEPT, height=0.72)
+        for pause in episode["pauses"]:
+            axes.barh(row, pause["length"], left=pause["start"], color=DROPPED, height=0.72)
+    axes.invert_yaxis()
+    axes.set(xlabel="time step of the recording", ylabel="demonstration")
+    handles = [plt.Rectangle((0, 0), 1, 1, color=c) for c in (KEPT, DROPPED)]
+    axes.legend(handles, ["kept", "dropped: pause"], loc="lower right", frameon=True, framealpha=0.9)
+    return _png(figure)
+
+
+def film_strip(frames: Sequence[NDArray[Any]], count: int = 6, width: int = 220) -> bytes:
+    """`count` frames, evenly spaced in time, side by side."""
+    picked = [frames[int(i)] for i in np.linspace(0, len(frames) - 1, count)]
+    height = round(width * picked[0].shape[0] / picked[0].shape[1])
+    small = [np.asarray(Image.fromarray(frame).resize((width, height))) for frame in picked]
+    buffer = io.BytesIO()
+    Image.fromarray(np.concatenate(small, axis=1)).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def animation(frames: Sequence[NDArray[Any]], fps: int, width: int = 320, hold_s: float = 1.2) -> bytes:
+    """A looping animation (WebP), the last frame held for a moment."""
+    height = round(width * frames[0].shape[0] / frames[0].shape[1])
+    pictures = [Image.fromarray(frame).resize((width, height)) for frame in frames]
+    durations = [round(1000 / fps)] * (len(pictures) - 1) + [round(1000 * hold_s)]
+    buffer = io.BytesIO()
+    pictures[0].save(
+        buffer, format="WEBP", save_all=True, append_images=pictures[1:], duration=durations, loop=0, quality=70
+    )
+    return buffer.getvalue()
