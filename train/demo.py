@@ -35,9 +35,9 @@ class DemoConfig:
     demonstrations: int = 30
     pause_share: float = 0.45
     seed: int = 0
-    offline_updates: int = 1000
-    steps: int = 3000
-    eval_freq: int = 600
+    offline_updates: int = 150
+    steps: int = 2400
+    eval_freq: int = 400
     eval_episodes: int = 20
     final_episodes: int = 50
     expert_episodes: int = 50

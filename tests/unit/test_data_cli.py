@@ -1,0 +1,72 @@
+"""The command line: quick help, one-line errors, exit codes."""
+
+import subprocess
+import sys
+
+import pytest
+
+from cqn_data.cli import OPERATIONS, main
+
+
+def fails(capsys, *args):
+    """Run, expect exit code 2 and one line on stderr, and return it."""
+    assert main(list(args)) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1, err
+    assert "Traceback" not in err
+    return err
+
+
+def test_help_needs_no_heavy_import():
+    code = (
+        "import sys; from cqn_data.cli import main; main(['--help']); main(['filter', '--help']);"
+        "main(['record', '--help']); sys.exit(any(m in sys.modules for m in ('torch', 'lerobot', 'datasets')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False)
+    assert done.returncode == 0, done.stderr
+    for word in (*OPERATIONS, "--threshold", "(default 0.005)", "--pause_share", "Example:"):
+        assert word in done.stdout
+
+
+def test_unknown_operation_names_the_nearest(capsys):
+    assert "Did you mean 'filter'?" in fails(capsys, "filtr")
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["--repo_id=a/b", "--treshold=1"], "Did you mean '--threshold'?"),
+        ([], "Missing --repo_id"),
+        (["--repo_id=a/b", "--threshold=abc"], "threshold"),
+        (["--repo_id=a/b", "--threshold=-1"], "positive"),
+        (["--repo_id=a/b", "--threshold=nan"], "positive"),
+        (["--repo_id=a/b", "--threshold"], "needs a value"),
+        (["--repo_id=a/b", "--keep_last=0"], "--keep_last >= 1"),
+        (["--repo_id=a/b", "--min_pause=0"], "--min_pause >= 1"),
+        (["--repo_id=a/b", "--reward=lst"], "Did you mean 'last'?"),
+        (["--repo_id=a/b", "--compare=x"], "after, before"),
+        (["--repo_id=a/b", '--joint_thresholds={"a": 0}'], "'a'"),
+        (["--repo_id=a/b", "stray"], "Unexpected 'stray'"),
+    ],
+)
+def test_filter_options_are_checked_before_anything_is_read(capsys, args, said):
+    assert said in fails(capsys, "filter", *args)
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["--episodes=0"], "--episodes >= 1"),
+        (["--pause_share=1"], "--pause_share in [0, 1)"),
+        (["--max_steps=0"], "--max_steps >= 1"),
+        (["--seed=-1"], "--seed >= 0"),
+    ],
+)
+def test_record_options_are_checked(capsys, args, said):
+    assert said in fails(capsys, "record", "--repo_id=a/b", *args)
+
+
+def test_debug_shows_the_exception():
+    with pytest.raises(ValueError, match="Unknown operation"):
+        main(["filtr", "--debug"])
