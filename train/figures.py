@@ -10,7 +10,7 @@ from PIL import Image
 
 from lerobot_cqn.errors import ConfigError
 
-__all__ = ["animation", "curves", "dropped_steps", "film_strip"]
+__all__ = ["animation", "curves", "dropped_steps", "film_strip", "poster"]
 
 COLOURS = {"filtered": "#1f77b4", "unfiltered": "#d95f02"}
 KEPT, DROPPED = "#1f77b4", "#d9d9d9"
@@ -75,6 +75,24 @@ def film_strip(frames: Sequence[NDArray[Any]], count: int = 6, width: int = 220)
     buffer = io.BytesIO()
     Image.fromarray(np.concatenate(small, axis=1)).save(buffer, format="PNG")
     return buffer.getvalue()
+
+
+def poster(curves_png: bytes, films: Mapping[str, Sequence[NDArray[Any]]], width: int = 1200) -> bytes:
+    """One picture for the README: film strips with captions, and the learning curves."""
+    plt = _pyplot()
+    strips = {name: np.asarray(Image.open(io.BytesIO(film_strip(frames, 8, 160)))) for name, frames in films.items()}
+    chart = np.asarray(Image.open(io.BytesIO(curves_png)).convert("RGB"))
+    heights = [picture.shape[0] / picture.shape[1] + 0.035 for picture in strips.values()]
+    ratios = [*heights, 0.75 * chart.shape[0] / chart.shape[1]]
+    figure, rows = plt.subplots(len(ratios), 1, figsize=(width / 100, sum(ratios) * width / 100), height_ratios=ratios)
+    for axes, (name, picture) in zip(rows, strips.items(), strict=False):
+        axes.imshow(picture, aspect="equal")
+        axes.set_title(name, loc="left", fontsize=13, pad=5)
+    rows[-1].imshow(chart)
+    for axes in rows:
+        axes.axis("off")
+    figure.subplots_adjust(left=0.01, right=0.99, top=0.97, bottom=0.0, hspace=0.16)
+    return _png(figure)
 
 
 def animation(frames: Sequence[NDArray[Any]], fps: int, width: int = 320, hold_s: float = 1.2) -> bytes:

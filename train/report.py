@@ -2,8 +2,10 @@
 
 import base64
 import html
+import io
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +20,7 @@ from lerobot_cqn.modeling_cqn import CQNPolicy
 
 from . import figures
 from .agent import Agent
+from .envs.registration import UR5eStationEnv
 from .evaluate import EVAL_SEED, evaluate, wilson_interval
 from .gym_env import GymEnvironment
 
@@ -36,7 +39,7 @@ def write_report(config: "DemoConfig", labels: Mapping[str, str], wall_s: float)
     out = config.output_dir
     dropped = json.loads((out / "dropped.json").read_text())
     evaluations = {name: read_rows(out / name / "evaluations.csv") for name in labels}
-    env_config = EnvConfig.get_choice_class("ur5e_station")()
+    env_config = UR5eStationEnv()
     expert, demo_frames = run_expert(env_config, config.expert_episodes, config.pause_share)
     steps = {"filtered": dropped["total"]["kept"], "unfiltered": dropped["total"]["steps"]}
     summary: dict[str, Any] = {
@@ -66,6 +69,7 @@ def write_report(config: "DemoConfig", labels: Mapping[str, str], wall_s: float)
         "curves": figures.curves(evaluations, labels, expert["success_rate"]),
         "dropped": figures.dropped_steps(dropped["episodes"]),
     }
+    pictures["poster"] = figures.poster(pictures["curves"], {k: v for k, v in films.items() if "offline" not in k})
     page = _page(summary, labels, dropped, pictures, films, env_config.fps)
     _write(out / "report.html", page)
     for name, picture in pictures.items():
@@ -106,7 +110,8 @@ def run_expert(config: EnvConfig, episodes: int, pause_share: float) -> tuple[di
 
 def film_policy(pretrained: Path, env_config: EnvConfig) -> Frames:
     """One evaluation episode of a checkpoint, as pictures."""
-    policy = CQNPolicy.from_pretrained(pretrained)
+    with redirect_stdout(io.StringIO()):  # LeRobot prints a line per loaded file
+        policy = CQNPolicy.from_pretrained(pretrained)
     pre, post = make_pre_post_processors(policy.config, pretrained_path=str(pretrained))
     env = GymEnvironment(env_config, policy.config)
     with torch.no_grad():

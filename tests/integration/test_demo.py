@@ -1,0 +1,56 @@
+"""The whole chain, small: record -> filter -> offline -> online -> evaluation -> report, by the demo's own commands."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TINY = (
+    "--demonstrations=3", "--offline_updates=4", "--steps=30", "--eval_freq=0", "--eval_episodes=1",
+    "--final_episodes=2", "--expert_episodes=2",
+)  # fmt: skip
+
+
+@pytest.mark.timeout(300)
+def test_demo_runs_every_arrow_and_a_second_start_does_not_repeat_it(tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    command = [sys.executable, "-m", "cqn_train.demo", f"--output_dir={out}", *TINY]
+    first = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert first.returncode == 0, first.stdout + first.stderr
+
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["expert"]["n"] == 2
+    kept, recorded = (summary["variants"][name]["steps_in_dataset"] for name in ("filtered", "unfiltered"))
+    assert kept < recorded
+    for variant in summary["variants"].values():
+        assert variant["offline"]["n"] == variant["online"]["n"] == 2
+        assert variant["online"]["updates"] > variant["offline"]["updates"] == 4
+        assert (
+            0 <= variant["online"]["ci_low"] <= variant["online"]["success_rate"] <= variant["online"]["ci_high"] <= 1
+        )
+
+    page = (out / "report.html").read_text()
+    assert not re.search(r"""(?:src|href)=["'](?!data:)""", page), "the report must not load anything"
+    assert page.count("data:image/webp") == 4
+    assert "scripted expert" in first.stdout
+    assert "Traceback" not in first.stdout + first.stderr
+
+    stamps = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
+    second = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert second.returncode == 0
+    assert "Already done" in second.stdout
+    assert stamps == {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
+
+
+def test_demo_names_the_command_that_failed(tmp_path: Path) -> None:
+    """A broken stage ends in one line with the log's last line, not in a traceback."""
+    out = tmp_path / "demo"
+    (out / "data" / "unfiltered").mkdir(parents=True)  # in the way of the recording
+    command = [sys.executable, "-m", "cqn_train.demo", f"--output_dir={out}", *TINY]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 2
+    assert "'record' failed" in result.stdout
+    assert "Traceback" not in result.stdout + result.stderr
