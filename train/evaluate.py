@@ -18,12 +18,21 @@ EVAL_SEED = 1_000_000
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Outcome of `n` evaluation episodes; steps: their lengths; frames: pictures of the first episodes."""
+    """What evaluation episodes came to; steps: their lengths; frames: pictures of the first episodes."""
 
-    successes: int
-    n: int
+    outcomes: list[bool]
     steps: list[int]
     frames: list[list[NDArray[Any]]] = field(default_factory=list)
+
+    @property
+    def n(self) -> int:
+        """Episodes."""
+        return len(self.outcomes)
+
+    @property
+    def successes(self) -> int:
+        """Successful episodes."""
+        return sum(self.outcomes)
 
     @property
     def success_rate(self) -> float:
@@ -59,7 +68,7 @@ def evaluate(
     film: int = 0,
 ) -> Evaluation:
     """Run `episodes` episodes without noise, as lerobot-eval does. film: episodes to take pictures of."""
-    successes, steps, films = 0, [], []
+    outcomes, steps, films = [], [], []
     for index in range(episodes):
         agent.policy.reset()
         frame, film_frames = env.reset(seed + index), []
@@ -73,7 +82,7 @@ def evaluate(
                 break
         if index < film:
             films.append([*film_frames, env.render()])
-        successes += outcome.success
+        outcomes.append(outcome.success)
         steps.append(count)
         on_episode(index + 1)
-    return Evaluation(successes, episodes, steps, films)
+    return Evaluation(outcomes, steps, films)

@@ -48,7 +48,7 @@ def curves(evaluations: Mapping[str, Rows], labels: Mapping[str, str], expert: f
         axes.fill_between(steps, low, high, color=COLOURS[name], alpha=0.15, linewidth=0)
     axes.axhline(expert, color="0.5", linestyle=":", linewidth=1, label="scripted expert")
     axes.set(xlabel="environment steps (0 is after offline training)", ylabel="success rate", ylim=(-0.03, 1.04))
-    axes.legend(loc="center right", frameon=False)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(evaluations) + 1, frameon=False)
     return _png(figure)
 
 
@@ -63,7 +63,10 @@ def dropped_steps(episodes: Sequence[Mapping[str, Any]]) -> bytes:
     axes.invert_yaxis()
     axes.set(xlabel="time step of the recording", ylabel="demonstration")
     handles = [plt.Rectangle((0, 0), 1, 1, color=c) for c in (KEPT, DROPPED)]
-    axes.legend(handles, ["kept", "dropped: pause"], loc="lower right", frameon=True, framealpha=0.9)
+    axes.legend(
+        handles, ["kept", "dropped: pause"], loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False
+    )
+    axes.margins(y=0.01)
     return _png(figure)
 
 

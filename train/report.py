@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 from lerobot.envs.configs import EnvConfig
 from lerobot.policies.factory import make_pre_post_processors
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from lerobot_cqn.modeling_cqn import CQNPolicy
 from . import figures
 from .agent import Agent
 from .envs.registration import UR5eStationEnv
-from .evaluate import EVAL_SEED, evaluate, wilson_interval
+from .evaluate import EVAL_SEED, Evaluation, evaluate, wilson_interval
 from .gym_env import GymEnvironment
 
 if TYPE_CHECKING:
@@ -40,7 +39,7 @@ def write_report(config: "DemoConfig", labels: Mapping[str, str], wall_s: float)
     dropped = json.loads((out / "dropped.json").read_text())
     evaluations = {name: read_rows(out / name / "evaluations.csv") for name in labels}
     env_config = UR5eStationEnv()
-    expert, demo_frames = run_expert(env_config, config.expert_episodes, config.pause_share)
+    expert = run_expert(env_config, config.expert_episodes)
     steps = {"filtered": dropped["total"]["kept"], "unfiltered": dropped["total"]["steps"]}
     summary: dict[str, Any] = {
         "task": "ur5e_station / click_button, state observations",
@@ -58,18 +57,13 @@ def write_report(config: "DemoConfig", labels: Mapping[str, str], wall_s: float)
             for name, rows in evaluations.items()
         },
     }
-    films = {"a demonstration, pauses in": demo_frames}
-    for name, text in labels.items():
-        for which, folder in (("after offline training", "000000"), ("after online training", "last")):
-            if name == "unfiltered" and which == "after offline training":
-                continue
-            pretrained = out / name / "checkpoints" / folder / "pretrained_model"
-            films[f"{text}: {which}"] = film_policy(pretrained, env_config)
+    films = make_films(out, labels, env_config, config.pause_share)
     pictures = {
         "curves": figures.curves(evaluations, labels, expert["success_rate"]),
         "dropped": figures.dropped_steps(dropped["episodes"]),
     }
-    pictures["poster"] = figures.poster(pictures["curves"], {k: v for k, v in films.items() if "offline" not in k})
+    if films:
+        pictures["poster"] = figures.poster(pictures["curves"], {k: v for k, v in films.items() if "offline" not in k})
     page = _page(summary, labels, dropped, pictures, films, env_config.fps)
     _write(out / "report.html", page)
     for name, picture in pictures.items():
@@ -78,46 +72,72 @@ def write_report(config: "DemoConfig", labels: Mapping[str, str], wall_s: float)
     return summary
 
 
-def run_expert(config: EnvConfig, episodes: int, pause_share: float) -> tuple[dict[str, Any], Frames]:
-    """Success of the scripted operator without pauses, and a film of one demonstration with them."""
-    env = gym.make(config.gym_id, disable_env_checker=True, **config.gym_kwargs)
-    station: Any = env.unwrapped
-    operator, successes = station.scripted_teleoperator(), 0
-    for episode in range(episodes):
-        env.reset(seed=EVAL_SEED + episode)
-        operator.reset(episode)
-        ended = False
-        while not ended:
-            _, _, terminated, truncated, info = env.step(operator.act())
-            ended = bool(terminated or truncated)
-        successes += bool(info["is_success"])
-    frames, pausing = [], station.scripted_teleoperator(pause_share=pause_share)
-    env.reset(seed=EVAL_SEED)
-    pausing.reset(0)
-    ended = False
-    while not ended:
-        frames.append(np.asarray(env.render()))
-        _, _, terminated, truncated, _ = env.step(pausing.act())
-        ended = bool(terminated or truncated)
-    frames.append(np.asarray(env.render()))
-    env.close()
+def typical_episode(out: Path, labels: Mapping[str, str], env_config: EnvConfig, look_at: int = 6) -> int:
+    """First evaluation episode in which each final policy does what it does in most of the first `look_at`."""
+    outcomes = [
+        run_policy(out / name / "checkpoints" / "last" / "pretrained_model", env_config, EVAL_SEED, look_at).outcomes
+        for name in labels
+    ]
+    usual = [sum(each) * 2 >= len(each) for each in outcomes]
+    return next((i for i in range(look_at) if [each[i] for each in outcomes] == usual), 0)
+
+
+def make_films(out: Path, labels: Mapping[str, str], env_config: EnvConfig, pause_share: float) -> dict[str, Frames]:
+    """The same scene as demonstrated and as each policy handles it; nothing where the machine cannot draw."""
+    seed = EVAL_SEED + typical_episode(out, labels, env_config)
+    try:
+        films = {"a demonstration, pauses in": film_demonstration(env_config, pause_share, seed)}
+    except Exception as error:  # graphics drivers raise kinds of their own; the numbers must not be lost with them
+        print(f"No films in the report, this machine cannot draw: {error}")  # noqa: T201
+        return {}
+    for which, folder in (("after offline training", "000000"), ("after online training", "last")):
+        for name, text in labels.items():
+            pretrained = out / name / "checkpoints" / folder / "pretrained_model"
+            result = run_policy(pretrained, env_config, seed, 1, film=1)
+            outcome = "success" if result.outcomes[0] else "out of time"
+            films[f"{text}, {which}: {outcome}"] = result.frames[0]
+    return films
+
+
+def run_expert(config: EnvConfig, episodes: int) -> dict[str, Any]:
+    """Success of the scripted operator, without pauses, on the evaluation seeds."""
+    successes = sum(_operate(config, EVAL_SEED + episode, 0.0)[0] for episode in range(episodes))
     low, high = wilson_interval(successes, episodes)
-    result = {
+    return {
         "n": episodes, "successes": successes, "success_rate": successes / episodes, "ci_low": low, "ci_high": high,
     }  # fmt: skip
-    return result, frames
 
 
-def film_policy(pretrained: Path, env_config: EnvConfig) -> Frames:
-    """One evaluation episode of a checkpoint, as pictures."""
+def film_demonstration(config: EnvConfig, pause_share: float, seed: int) -> Frames:
+    """Pictures of one demonstration with its pauses."""
+    return _operate(config, seed, pause_share, film=True)[1]
+
+
+def _operate(config: EnvConfig, seed: int, pause_share: float, *, film: bool = False) -> tuple[bool, Frames]:
+    """One episode of the scripted operator: whether it succeeded, and pictures when asked for."""
+    env = gym.make(config.gym_id, disable_env_checker=True, **config.gym_kwargs)
+    station: Any = env.unwrapped
+    operator, frames, ended, info = station.scripted_teleoperator(pause_share=pause_share), [], False, {}
+    env.reset(seed=seed)
+    operator.reset(seed)
+    while not ended:
+        frames += [np.asarray(env.render())] if film else []
+        _, _, terminated, truncated, info = env.step(operator.act())
+        ended = bool(terminated or truncated)
+    frames += [np.asarray(env.render())] if film else []
+    env.close()
+    return bool(info["is_success"]), frames
+
+
+def run_policy(pretrained: Path, env_config: EnvConfig, seed: int, episodes: int, film: int = 0) -> Evaluation:
+    """Evaluation episodes of a checkpoint, the first `film` of them with pictures."""
     with redirect_stdout(io.StringIO()):  # LeRobot prints a line per loaded file
         policy = CQNPolicy.from_pretrained(pretrained)
     pre, post = make_pre_post_processors(policy.config, pretrained_path=str(pretrained))
     env = GymEnvironment(env_config, policy.config)
-    with torch.no_grad():
-        result = evaluate(Agent(policy, pre, post), env, 1, film=1)
+    result = evaluate(Agent(policy, pre, post), env, episodes, seed=seed, film=film)
     env.close()
-    return result.frames[0]
+    return result
 
 
 def _result(rows: Sequence[Mapping[str, str]], phase: str) -> dict[str, Any]:
@@ -202,7 +222,8 @@ each; {summary["wall_s"] / 60:.1f} minutes for everything.</p>
 <h2>What the filter dropped</h2>{_image(pictures["dropped"], "png", "dropped time steps per demonstration")}
 <p class="note">{total["steps"]} time steps recorded, {total["kept"]} kept. A step is a pause when no joint moved by
 more than the threshold since the last kept step; gripper changes and the last step are always kept.</p>
-<h2>What it looks like</h2><div class="films">{film_html}</div>
+<h2>What it looks like</h2><p class="note">One scene, the first in which each final policy does what it does in most
+of its first six evaluation episodes.</p><div class="films">{film_html}</div>
 <h2>The same, frame by frame</h2>{strips}
 <h2>Do it again</h2><pre>make demo
 lerobot-eval --policy.path={html.escape(config["output_dir"])}/filtered/checkpoints/last/pretrained_model \\

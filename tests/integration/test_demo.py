@@ -34,7 +34,7 @@ def test_demo_runs_every_arrow_and_a_second_start_does_not_repeat_it(tmp_path: P
 
     page = (out / "report.html").read_text()
     assert not re.search(r"""(?:src|href)=["'](?!data:)""", page), "the report must not load anything"
-    assert page.count("data:image/webp") == 4
+    assert page.count("data:image/webp") == 5
     assert "scripted expert" in first.stdout
     assert "Traceback" not in first.stdout + first.stderr
 
