@@ -14,13 +14,12 @@ def random_shift(pixels: Tensor, pad: int, generator: torch.Generator | None = N
     """
     if pad == 0:
         return pixels
-    batch, _, height, width = pixels.shape
-    rows = torch.arange(-pad, height + pad, device=pixels.device).clamp_(0, height - 1)
-    columns = torch.arange(-pad, width + pad, device=pixels.device).clamp_(0, width - 1)
-    padded = pixels.index_select(2, rows).index_select(3, columns)
-    windows = padded.unfold(2, height, 1).unfold(3, width, 1)  # [B, C, 2*pad+1, 2*pad+1, H, W], a view
+    batch, channels, height, width = pixels.shape
     offset = torch.randint(2 * pad + 1, (2, batch), generator=generator).to(pixels.device)
-    return windows[torch.arange(batch, device=pixels.device), :, offset[0], offset[1]]
+    rows = (torch.arange(-pad, height - pad, device=pixels.device) + offset[0, :, None]).clamp_(0, height - 1)
+    columns = (torch.arange(-pad, width - pad, device=pixels.device) + offset[1, :, None]).clamp_(0, width - 1)
+    source = (rows[:, :, None] * width + columns[:, None, :]).flatten(1)  # [B, H*W], where each pixel comes from
+    return pixels.flatten(2).gather(2, source[:, None].expand(-1, channels, -1)).view(pixels.shape)
 
 
 def colour_jitter(

@@ -101,8 +101,11 @@ class CQNConfig(PreTrainedConfig):
         """Frames of the current stack and, when RL is on, of the stack n steps later."""
         s = self.settings
         now = set(range(1 - s.frame_stack, 1))
-        later = {index + s.n_step for index in now} if s.rl_loss_scale > 0 else set()
-        return sorted(now | later)
+        if s.rl_loss_scale == 0:
+            return sorted(now)
+        if s.frame_stack > 2:  # where an episode ends inside the window, the later stack reaches back between them
+            return list(range(1 - s.frame_stack, s.n_step + 1))
+        return sorted(now | {index + s.n_step for index in now})
 
     @property
     def action_delta_indices(self) -> list[int]:

@@ -50,9 +50,6 @@ class CQNModel(nn.Module):
         self.target_critic.requires_grad_(False)
         values = support(settings.v_min, settings.v_max, settings.critic_atoms)
         self.register_buffer("support", values, persistent=False)
-        if settings.channels_last:
-            for encoder in encoders:
-                encoder.convolutions.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     # -- observation ---------------------------------------------------------------------------------------
 
@@ -68,11 +65,11 @@ class CQNModel(nn.Module):
         """Pixel features [B, E] (None without cameras) and low-dim values [B, S*P] (None without state)."""
         if not observation.pixels:
             return None, observation.low_dim
+        # Pictures only: LeRobot cannot save the optimiser state of weights in this layout, which gain nothing from it.
         layout = torch.channels_last if self.settings.channels_last else torch.contiguous_format
         with self._autocast():
             views = [
-                encoder((_unit(view) - 0.5).contiguous(memory_format=layout))
-                for encoder, view in zip(self.encoders, observation.pixels, strict=True)
+                encoder(_centred(view, layout)) for encoder, view in zip(self.encoders, observation.pixels, strict=True)
             ]
         return torch.cat(views, dim=-1), observation.low_dim
 
@@ -196,6 +193,13 @@ class CQNModel(nn.Module):
 def _unit(pixels: Tensor) -> Tensor:
     """uint8 in [0, 255] -> float in [0, 1]; floats pass."""
     return pixels.float() / 255 if pixels.dtype == torch.uint8 else pixels
+
+
+def _centred(pixels: Tensor, layout: torch.memory_format) -> Tensor:
+    """uint8 in [0, 255] or float in [0, 1] -> float in [-0.5, 0.5] in the given memory layout."""
+    if pixels.dtype == torch.uint8:  # the layout changes while values are small, the rest is in place
+        return pixels.to(torch.float32, memory_format=layout).div_(255).sub_(0.5)
+    return (pixels - 0.5).contiguous(memory_format=layout)
 
 
 def _take(values: Tensor, index: Tensor) -> Tensor:

@@ -3,6 +3,8 @@
 All take the predictions of every level and dimension at once and average over L and D as Algorithm 2 does.
 """
 
+from typing import Any
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -29,11 +31,33 @@ def dominance_loss(probs: Tensor, expert: Tensor) -> Tensor:
     probs: [B, L, D, N, A]; expert: int64 [B, L, D], the bin of the demonstrated action.
     Sum over atoms of max(0, CDF(expert) - CDF(other)). Returns [B], the mean over L, D and N.
     """
-    atoms = probs.shape[-1]
-    # A product with a triangle of ones is the cumulative sum, and several times faster than torch.cumsum on CPU.
-    cdf = probs @ torch.ones(atoms, atoms, device=probs.device, dtype=probs.dtype).triu()
-    expert_cdf = _take_bin(cdf, expert)
-    return (expert_cdf - cdf).clamp(min=0).sum(-1).mean((1, 2, 3))
+    loss: Tensor = _Dominance.apply(probs, expert)  # type: ignore[no-untyped-call]
+    return loss
+
+
+class _Dominance(torch.autograd.Function):
+    """`dominance_loss` with its gradient written out: fewer passes over [B, L, D, N, A], and counts stay exact.
+
+    With cdf = cumsum(probs), the loss of a sample is mean(sum over atoms of max(0, cdf[expert] - cdf)).
+    """
+
+    @staticmethod
+    def forward(ctx: Any, probs: Tensor, expert: Tensor) -> Tensor:
+        cdf = probs.cumsum(-1)
+        gap = cdf.neg_().sub_(_take_bin(cdf, expert))  # cdf is negated by now: CDF(expert) - CDF
+        ctx.save_for_backward(gap >= 0, expert)  # equality counts, as for torch.clamp: a new critic is all ties
+        return gap.clamp_(min=0).sum(-1).mean((1, 2, 3))
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        ahead, expert = ctx.saved_tensors
+        flow = ahead.to(grad.dtype).neg_()  # d loss / d cdf in whole numbers: -1 where the other bin is ahead, ...
+        index = _bin_index(expert, flow.shape[-1])
+        flow.scatter_add_(-2, index, -flow.sum(-2, keepdim=True))  # ... and their number at the expert's bin
+        # Each probability enters its own and every later value of the cdf: sum(flow[j:]) for atom j.
+        tail = flow.cumsum(-1).neg_().add_(flow).add_(flow.sum(-1, keepdim=True))
+        per_entry = grad / (flow[0].numel() // flow.shape[-1])
+        return tail.mul_(per_entry[:, None, None, None, None]), None
 
 
 def margin_loss(q: Tensor, expert: Tensor, margin: float) -> Tensor:
@@ -57,4 +81,9 @@ def demo_mean(per_sample: Tensor, demo: Tensor) -> Tensor:
 
 def _take_bin(values: Tensor, index: Tensor) -> Tensor:
     """[B, L, D, N, A], [B, L, D] -> [B, L, D, 1, A]."""
-    return values.gather(-2, index[..., None, None].expand(*index.shape, 1, values.shape[-1]))
+    return values.gather(-2, _bin_index(index, values.shape[-1]))
+
+
+def _bin_index(index: Tensor, atoms: int) -> Tensor:
+    """[B, L, D] -> [B, L, D, 1, A], as gather and scatter want it."""
+    return index[..., None, None].expand(*index.shape, 1, atoms)

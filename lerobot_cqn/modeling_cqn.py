@@ -152,13 +152,17 @@ class CQNPolicy(PreTrainedPolicy):
         demo = torch.ones_like(action[:, :1])
         if s.rl_loss_scale == 0:  # imitation only (CBC): rewards and next observations are not read
             return Batch(observation, action, demo * 0, demo * 0, observation, demo)
-        later = [deltas.index(index + s.n_step) for index in range(1 - s.frame_stack, 1)]
-        next_observation = self.stack({key: value[:, later] for key, value in frames.items()})
-        reward, discount = self._n_step(batch, action)
+        reward, discount, window = self._n_step(batch, action)
+        # The stack that ends where the window does. An offset that was not loaded lies at the episode's end, where
+        # the last one, repeated, is the same frame.
+        loaded = [deltas.index(i) if i in deltas else -1 for i in range(1 - s.frame_stack, s.n_step + 1)]
+        row = torch.arange(len(action), device=action.device)[:, None]
+        later = torch.tensor(loaded, device=action.device)[window + torch.arange(s.frame_stack, device=action.device)]
+        next_observation = self.stack({key: value[row, later] for key, value in frames.items()})
         return Batch(observation, action, reward, discount, next_observation, demo)
 
-    def _n_step(self, batch: dict[str, Tensor], like: Tensor) -> tuple[Tensor, Tensor]:
-        """Discounted reward sum and bootstrap discount, both [B, 1]."""
+    def _n_step(self, batch: dict[str, Tensor], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Discounted reward sum, bootstrap discount and length of the window in steps, all [B, 1]."""
         if not len(self.episode_end):
             raise ConfigError(
                 "The policy was made without a dataset and cannot tell where episodes end: make it with "
@@ -177,8 +181,9 @@ class CQNPolicy(PreTrainedPolicy):
         at_last = (remaining - 1).clamp(max=s.n_step - 1)
         # A success is a real termination; an episode that ended without one only ran out of time.
         terminal = (remaining <= s.n_step) & (rewards.gather(1, at_last) > 0)
-        discount = s.discount ** remaining.clamp(max=s.n_step).to(like)
-        return reward, torch.where(terminal, torch.zeros_like(discount), discount)
+        window = remaining.clamp(max=s.n_step)
+        discount = s.discount ** window.to(like)
+        return reward, torch.where(terminal, torch.zeros_like(discount), discount), window
 
     def _with_time(self, batch: dict[str, Tensor], key: str) -> Tensor:
         if key not in batch:

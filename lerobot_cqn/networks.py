@@ -138,7 +138,8 @@ class CoarseToFineNetwork(nn.Module):
         value = self.value(projected.value, previous, levels).float()
         advantage = advantage.view(batch, count, self.dims, self.bins, self.atoms)
         value = value.view(batch, count, self.dims, 1, self.atoms)
-        logits: Tensor = advantage + (value - advantage.mean(-2, keepdim=True))
+        # A sum, then a division of the small result: the gradient of `mean` would be a pass over all logits.
+        logits: Tensor = advantage + (value - advantage.sum(-2, keepdim=True) / self.bins)
         return logits
 
 

@@ -41,7 +41,8 @@ def last_checkpoint(output_dir: Path) -> Path:
     last = output_dir / "checkpoints" / "last"
     if not (last / "training_state").is_dir():
         raise DataError(
-            f"Nothing to resume in {output_dir}: expected checkpoints/last; leave out --resume to start anew."
+            f"Nothing to resume in {output_dir}: expected checkpoints/last, which the first save makes; leave out "
+            "--resume to start anew in a new or empty folder."
         )
     return last
 
@@ -74,18 +75,16 @@ def save(
     replay.save(state / "online_episodes.npz", first_online)
     progress = {"counters": asdict(counters), "tables": tables, "numpy_rng": rng.bit_generator.state}
     (state / "progress.json").write_text(json.dumps(progress))
-    if target.exists():  # same step again (an interrupt right after a save)
-        old = folder / f".{target.name}.old"
-        shutil.rmtree(old, ignore_errors=True)
-        target.rename(old)
-        temporary.rename(target)
-        shutil.rmtree(old)
-    else:
-        temporary.rename(target)
-    link = folder / ".last.tmp"
-    link.unlink(missing_ok=True)
-    link.symlink_to(target.name)
-    os.replace(link, folder / "last")
+    old = folder / f".{target.name}.old"
+    if target.exists():  # same step again (the end right after a save): `last` must never point nowhere
+        if (folder / "last").resolve() == target.resolve():
+            shutil.rmtree(old, ignore_errors=True)
+            shutil.copytree(target, old, copy_function=_link_or_copy)
+            _point_last(folder, old)
+        shutil.rmtree(target)
+    temporary.rename(target)
+    _point_last(folder, target)
+    shutil.rmtree(old, ignore_errors=True)
     _forget_old_states(folder, target)
     return target
 
@@ -109,6 +108,22 @@ def seed_everything(seed: int) -> np.random.Generator:
     np.random.seed(seed)  # some environments draw from it
     torch.manual_seed(seed)
     return np.random.default_rng(seed)
+
+
+def _point_last(folder: Path, target: Path) -> None:
+    """Make `last` point at `target` in one step."""
+    link = folder / ".last.tmp"
+    link.unlink(missing_ok=True)
+    link.symlink_to(target.name)
+    os.replace(link, folder / "last")
+
+
+def _link_or_copy(source: str, destination: str) -> None:
+    """A second name for the same bytes where the file system knows hard links, else a copy."""
+    try:
+        os.link(source, destination)
+    except OSError:
+        shutil.copy2(source, destination)
 
 
 def _forget_old_states(folder: Path, newest: Path) -> None:

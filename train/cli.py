@@ -1,16 +1,25 @@
 """`cqn-train`: parse, check, put the parts together, run. The only composition root."""
 
+import contextlib
+import io
 import logging
+import re
 import signal
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import fields
+from difflib import get_close_matches
 from pathlib import Path
-from types import FrameType
-from typing import Any
+from types import FrameType, TracebackType
+from typing import Any, Self
 
 import draccus
 import torch
+from datasets import disable_progress_bars
+from draccus.utils import DecodingError, ParsingError
+from huggingface_hub.errors import HfHubHTTPError, HFValidationError
 from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType
@@ -20,14 +29,14 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_cqn.configuration_cqn import CQNConfig
-from lerobot_cqn.errors import ConfigError, CQNError, OutputExistsError
+from lerobot_cqn.errors import ConfigError, CQNError, OutputExistsError, one_of
 from lerobot_cqn.learner import Learner
 from lerobot_cqn.modeling_cqn import CQNPolicy
 
 from . import envs  # noqa: F401  # registers our environments
 from .agent import Agent
 from .checkpoint import Counters, last_checkpoint, restore, save, seed_everything
-from .config import RunConfig
+from .config import DatasetSettings, EvalSettings, RunConfig, WandBSettings
 from .console import ConsoleMonitor
 from .demonstrations import load_episodes, load_metadata
 from .gym_env import GymEnvironment
@@ -36,6 +45,8 @@ from .online import Interrupted, Trainer
 from .replay import Replay
 
 __all__ = ["main"]
+
+logger = logging.getLogger(f"{__package__}.cli")  # under python -m, __name__ is __main__
 
 EXAMPLES = """\
 Train a Coarse-to-fine Q-Network from demonstrations, then online.
@@ -70,20 +81,42 @@ def parse(arguments: Sequence[str]) -> RunConfig:
     if path is not None:
         arguments = [a for a in arguments if not a.startswith("--policy.")]
         overrides = [a for a in overrides if not a.startswith("--path")]
+    for kind in ("policy", "env"):
+        settings = [a for a in arguments if a.startswith(f"--{kind}.")]
+        if settings and config_file is None and parser.parse_arg(f"{kind}.type", arguments) is None:
+            raise ConfigError(f"{settings[0]} needs to know of which {kind}: give --{kind}.type=... as well.")
+    complaint = io.StringIO()  # argparse prints pages of usage before it says what is wrong
     try:
-        config: RunConfig = draccus.parse(RunConfig, config_path=config_file, args=arguments)
+        with contextlib.redirect_stderr(complaint):
+            config: RunConfig = draccus.parse(RunConfig, config_path=config_file, args=arguments)
         if path is not None:
-            if not (Path(path) / "config.json").is_file() and Path(path).exists():
-                raise ConfigError(f"No policy in {path}: expected config.json; give the `pretrained_model` folder.")
-            policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
-            policy.pretrained_path = Path(path)
-            config.policy = policy
+            with contextlib.redirect_stderr(complaint):
+                config.policy = _pretrained_config(path, overrides)
     except CQNError:
         raise
-    except Exception as error:  # draccus and huggingface_hub raise many kinds
-        cause = _user_cause(error)
-        raise ConfigError(cause) from error
+    except SystemExit as error:
+        raise ConfigError(_option_error(complaint.getvalue(), arguments)) from error
+    except Exception as error:  # draccus raises many kinds
+        raise ConfigError(_user_cause(error)) from error
+    wanted = parser.parse_arg("device", overrides)
+    if wanted and config.policy and config.policy.device != wanted:
+        logger.warning("The device '%s' is not available: using '%s'.", wanted, config.policy.device)
     return config
+
+
+def _pretrained_config(path: str, overrides: list[str]) -> PreTrainedConfig:
+    """Config of a trained policy, from a folder or the Hub, with the command line's values on top."""
+    if Path(path).exists() and not (Path(path) / "config.json").is_file():
+        raise ConfigError(f"No policy in {path}: expected config.json; give the `pretrained_model` folder.")
+    try:
+        policy: PreTrainedConfig = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+    except (OSError, HfHubHTTPError, HFValidationError) as error:  # no such folder, and the Hub knows nothing of it
+        raise ConfigError(
+            f"No policy at {path}: expected a `pretrained_model` folder (or user/name on the Hub, which could not be "
+            "reached or has no such policy); check --policy.path."
+        ) from error
+    policy.pretrained_path = Path(path)
+    return policy
 
 
 def build(config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], bool]) -> Trainer:
@@ -113,7 +146,7 @@ def build(config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], 
     run_config = draccus.encode(config)
     wandb = None
     if config.wandb.enable:
-        wandb = start_wandb(config.wandb.project, config.output_dir.name, run_config, config.wandb.mode)
+        wandb = _start_wandb(config, run_config)
     metrics = Metrics(config.output_dir, wandb)
     learner, counters = Learner(agent.policy.model), Counters()
     if checkpoint is not None:
@@ -136,7 +169,13 @@ def make_agent(config: RunConfig, checkpoint: Path | None) -> Agent:
     assert isinstance(config.policy, CQNConfig) and config.env is not None  # noqa: S101, PT018
     pretrained = checkpoint / "pretrained_model" if checkpoint is not None else config.policy.pretrained_path
     if pretrained is not None:
-        policy = CQNPolicy.from_pretrained(pretrained, config=config.policy)
+        try:
+            policy = CQNPolicy.from_pretrained(pretrained, config=config.policy)
+        except RuntimeError as error:  # torch names every tensor that differs
+            raise ConfigError(
+                f"The weights in {pretrained} do not fit: leave out the --policy.* settings that change the network "
+                "(sizes, levels, bins, atoms, frame_stack), or start anew."
+            ) from error
         pre, post = make_pre_post_processors(config.policy, pretrained_path=str(pretrained))
     elif config.dataset.repo_id:
         meta = load_metadata(config.dataset)
@@ -146,6 +185,18 @@ def make_agent(config: RunConfig, checkpoint: Path | None) -> Agent:
         raise ConfigError("A new policy needs a dataset for its features and action bounds: give --dataset.repo_id=...")
     policy.train()
     return Agent(policy, pre, post)
+
+
+def _start_wandb(config: RunConfig, run_config: Any) -> Any:
+    assert config.output_dir is not None  # noqa: S101
+    try:
+        return start_wandb(config.wandb.project, config.output_dir.name, run_config, config.wandb.mode)
+    except CQNError:
+        raise
+    except Exception as error:  # wandb raises many kinds
+        raise ConfigError(
+            f"Weights & Biases does not start: {error} Log in with `wandb login`, or give --wandb.mode=offline."
+        ) from error
 
 
 def check_fits(env: EnvConfig, policy: CQNPolicy) -> None:
@@ -174,12 +225,22 @@ def check_fits(env: EnvConfig, policy: CQNPolicy) -> None:
 
 
 class StopRequest:
-    """Ctrl-C or SIGTERM once: stop at the next safe point; twice: at once."""
+    """Ctrl-C or SIGTERM once: stop at the next safe point; twice: at once. Use as a context manager."""
 
     def __init__(self) -> None:
         self.asked = False
+        self._before: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> Self:
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._on_signal)
+            self._before[number] = signal.signal(number, self._on_signal)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
         if self.asked:
@@ -197,18 +258,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in arguments
     arguments = [a for a in arguments if a != "--debug"]
-    logging.basicConfig(level=logging.DEBUG if debug else logging.ERROR, format="%(message)s")
-    logging.getLogger("cqn_train").setLevel(logging.INFO)
+    set_up_logging(debug)
     register_third_party_plugins()
     if not arguments or "-h" in arguments or "--help" in arguments:
         print(EXAMPLES)  # noqa: T201
         parser.print_scoped_help(RunConfig, arguments)
         return 0
+    try:
+        return run(parse(arguments))
+    except KeyboardInterrupt:
+        print("cqn-train: stopped at once; the last checkpoint is untouched.", file=sys.stderr)  # noqa: T201
+        return 130
+    except (CQNError, OSError) as error:
+        if debug:
+            traceback.print_exc()
+        print(f"cqn-train: {' '.join(str(error).split())}", file=sys.stderr)  # noqa: T201
+        return 2
+
+
+def run(config: RunConfig) -> int:
+    """Build and train; 0 when complete, 130 when stopped on request with a checkpoint saved."""
     trainer: Trainer | None = None
     try:
-        config = parse(arguments)
-        with ConsoleMonitor() as monitor:
-            trainer = build(config, monitor, StopRequest())
+        with ConsoleMonitor() as monitor, StopRequest() as should_stop:
+            trainer = build(config, monitor, should_stop)
             try:
                 trainer.run()
             except Interrupted:
@@ -217,14 +290,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 return 130
             monitor.message(f"Policy: {config.output_dir}/checkpoints/last/pretrained_model")
         return 0
-    except CQNError as error:
-        if debug:
-            traceback.print_exc()
-        print(f"cqn-train: {' '.join(str(error).split())}", file=sys.stderr)  # noqa: T201
-        return 2
     finally:
         if trainer is not None:
             trainer.env.close()
+
+
+def set_up_logging(debug: bool) -> None:
+    """Our notices on stderr, and of the libraries below only errors (all they say with --debug).
+
+    LeRobot warns of missing accelerators and decoders on every start; a person could not find our line in between.
+    """
+    root, ours = logging.getLogger(), logging.getLogger(__package__)
+    root.setLevel(logging.DEBUG if debug else logging.ERROR)
+    if debug:
+        logging.basicConfig()
+    else:
+        warnings.simplefilter("ignore")
+        disable_progress_bars()
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(message)s"))
+    ours.handlers, ours.propagate = [handler], False
+    ours.setLevel(logging.INFO)
 
 
 def _flag(arguments: Sequence[str], name: str) -> bool:
@@ -233,12 +319,47 @@ def _flag(arguments: Sequence[str], name: str) -> bool:
 
 
 def _user_cause(error: BaseException) -> str:
-    """The message of the deepest cause: draccus wraps what a config's own check said."""
-    while error.__cause__ is not None or error.__context__ is not None:
-        if isinstance(error, CQNError):
-            break
-        error = error.__cause__ or error.__context__  # type: ignore[assignment]
-    return str(error) or type(error).__name__
+    """What a person can act on: a config's own check where there was one, else the field that did not parse."""
+    chain: list[BaseException] = []
+    cause: BaseException | None = error
+    while cause is not None and cause not in chain:
+        chain.append(cause)
+        cause = cause.__cause__ or cause.__context__
+    ours = [e for e in chain if isinstance(e, CQNError)]
+    parsing = [e for e in chain if isinstance(e, DecodingError | ParsingError)]
+    wrapped = parsing and str(parsing[-1]).startswith("Couldn't instantiate")  # a check of LeRobot's own
+    said = (ours or ([] if wrapped else parsing[-1:]) or chain[-1:])[0]
+    return str(said) or type(said).__name__
+
+
+def _option_error(complaint: str, arguments: Sequence[str]) -> str:
+    """Argparse's pages in one line, with the nearest option or choice."""
+    text = (complaint.strip().splitlines() or ["unreadable options"])[-1].partition("error: ")[2]
+    choice = re.search(r"argument (\S+): invalid choice: '(.*?)' \(choose from (.*)\)", text)
+    if choice:
+        return one_of(f"value of {choice[1]}", choice[2], re.findall(r"[\w.-]+", choice[3]))
+    unknown = re.search(r"unrecognized arguments: (\S+)", text)
+    if unknown is None:
+        return f"{text} (--help lists all options)"
+    name = unknown[1].partition("=")[0]
+    if not any(a.startswith(name) for a in arguments):  # read as an override of a trained policy
+        name = name.replace("--", "--policy.", 1)
+    near = get_close_matches(name, _options(arguments), n=1)
+    hint = f" Did you mean '{near[0]}'?" if near else ""
+    return f"Unknown option '{name}': expected --name=value with a name that --help lists.{hint}"
+
+
+def _options(arguments: Sequence[str]) -> list[str]:
+    """Every option there is for the chosen environment."""
+    groups: dict[str, type] = {
+        "": RunConfig, "policy.": CQNConfig, "dataset.": DatasetSettings, "eval.": EvalSettings,
+        "wandb.": WandBSettings,
+    }  # fmt: skip
+    env = parser.parse_arg("env.type", list(arguments))
+    if env in EnvConfig.get_known_choices():
+        groups["env."] = EnvConfig.get_choice_class(env)
+    names = [f"--{group}{field.name}" for group, config in groups.items() for field in fields(config)]
+    return [*names, "--policy.type", "--policy.path", "--env.type"]
 
 
 if __name__ == "__main__":

@@ -27,9 +27,9 @@ _SCHEDULES: dict[str, dict[str, int]] = {
 class DatasetSettings:
     """Demonstrations: a LeRobotDataset v3, on disk under `root` or in LeRobot's cache or on the Hub."""
 
-    repo_id: str = ""
-    root: str | None = None
-    episodes: list[int] | None = None
+    repo_id: str = ""  # as user/name; any name for a local folder
+    root: str | None = None  # the dataset's folder; None: LeRobot's cache or the Hub
+    episodes: list[int] | None = None  # only these episodes
 
 
 @dataclass
@@ -37,8 +37,8 @@ class EvalSettings:
     """Evaluation episodes: deterministic policy, fixed seeds."""
 
     freq: int = 1000  # environment steps between evaluations; 0: only after the offline phase and at the end
-    n_episodes: int = 20
-    final_n_episodes: int = 50
+    n_episodes: int = 20  # of each evaluation on the way
+    final_n_episodes: int = 50  # after the offline phase and at the end
 
 
 @dataclass
@@ -60,15 +60,15 @@ class RunConfig:
     policy: PreTrainedConfig | None = None
     env: EnvConfig | None = None
     dataset: DatasetSettings = field(default_factory=DatasetSettings)
-    output_dir: Path | None = None
-    resume: bool = False
-    seed: int = 1000
-    steps: int = 30_000
-    offline_updates: int = 0
-    updates_per_step: int | None = None
-    updates_per_episode: int | None = None
-    batch_size: int | None = None
-    demo_batch_size: int | None = None
+    output_dir: Path | None = None  # a new or empty folder for checkpoints and metrics
+    resume: bool = False  # continue the run in output_dir from its last checkpoint
+    seed: int = 1000  # of weights, batches, exploration and training scenes
+    steps: int = 30_000  # control steps online; 0 trains offline only
+    offline_updates: int = 0  # updates on the demonstrations before the first step
+    updates_per_step: int | None = None  # after each control step; None: the preset's
+    updates_per_episode: int | None = None  # between episodes; None: the preset's
+    batch_size: int | None = None  # from everything seen; None: the preset's
+    demo_batch_size: int | None = None  # from demonstrations and successes, on top; None: the preset's
     relabel: bool = True  # successful online episodes become demonstrations
     save_freq: int = 5000  # environment steps between checkpoints; the end and an interrupt always save
     log_freq: int = 50  # updates between rows of updates.csv

@@ -10,6 +10,7 @@ import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME
+from lerobot.utils.feature_utils import dataset_to_policy_features
 from numpy.typing import NDArray
 
 from lerobot_cqn.errors import DataError
@@ -36,9 +37,18 @@ def load_metadata(settings: DatasetSettings) -> LeRobotDatasetMetadata:
         meta = LeRobotDatasetMetadata(settings.repo_id, root=settings.root)
     except Exception as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise DataError(f"Cannot read the dataset '{settings.repo_id}' at {root}: {reason}") from error
+        raise DataError(
+            f"Cannot read the dataset '{settings.repo_id}' at {root}: {reason} Expected a LeRobotDataset v3: check "
+            "--dataset.repo_id, and --dataset.root when it is local."
+        ) from error
     if not meta.total_episodes or not meta.total_frames:
-        raise DataError(f"The dataset at {root} is empty: expected at least one episode.")
+        raise DataError(f"The dataset at {root} is empty: expected at least one episode; record some first.")
+    chosen = range(meta.total_episodes) if settings.episodes is None else settings.episodes
+    if not chosen or min(chosen) < 0 or max(chosen) >= meta.total_episodes:
+        raise DataError(
+            f"--dataset.episodes={settings.episodes}: expected at least one of the episodes 0 to "
+            f"{meta.total_episodes - 1} that the dataset at {root} holds."
+        )
     return meta
 
 
@@ -51,6 +61,7 @@ def load_episodes(
     Datasets do not store what came after the last action: the last observation stands in for it.
     Raises DataError for a missing feature, another size, or values that are not finite.
     """
+    load_metadata(settings)
     dataset = LeRobotDataset(settings.repo_id, root=settings.root, episodes=settings.episodes)
     policy = agent.policy
     missing = [key for key in (*policy.view_keys, *policy.low_dim_keys, ACTION) if key not in dataset.features]
@@ -58,17 +69,24 @@ def load_episodes(
         raise DataError(
             f"The dataset has no '{missing[0]}', which the policy needs; it has {sorted(dataset.features)}."
         )
-    dims = dataset.features[ACTION]["shape"][0]
-    if dims != policy.action_dims:
-        raise DataError(f"The dataset's actions have {dims} dimensions, the policy's {policy.action_dims}.")
+    found = dataset_to_policy_features(dataset.features)
+    for key, feature in {**(policy.config.input_features or {}), ACTION: policy.config.action_feature}.items():
+        if tuple(found[key].shape) != tuple(feature.shape):
+            raise DataError(
+                f"'{key}' has shape {tuple(found[key].shape)} in the dataset, but {tuple(feature.shape)} in the "
+                "policy: train a new policy, or give the dataset this one was trained on."
+            )
     rewarded = NEXT_REWARD in dataset.features
-    if not rewarded:
-        logger.warning("No '%s' column: the last step of each episode counts as the success.", NEXT_REWARD)
     columns = dataset.hf_dataset.with_format("numpy")
     numbers = np.asarray(columns["episode_index"])
     raw = {key: _column(columns, key) for key in (*policy.low_dim_keys, ACTION, *([NEXT_REWARD] if rewarded else []))}
     _check_finite(raw, numbers)
-    prepared = agent.prepare({key: torch.from_numpy(value).float() for key, value in raw.items() if key != NEXT_REWARD})
+    if not rewarded:
+        logger.warning("No '%s' column: the last step of each episode counts as the success.", NEXT_REWARD)
+    vectors = {key: torch.from_numpy(value).float() for key, value in raw.items() if key != NEXT_REWARD}
+    if not policy.low_dim_keys:  # LeRobot's steps insist on an observation; pictures are decoded below
+        vectors[policy.view_keys[0]] = torch.zeros(1, 3, 1, 1)
+    prepared = agent.prepare(vectors)
     low_dim, action = agent.low_dim(prepared), prepared[ACTION].cpu().numpy()
     episodes = []
     ids = np.unique(numbers)

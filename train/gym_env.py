@@ -12,7 +12,7 @@ from lerobot.envs.utils import preprocess_observation
 from lerobot.utils.constants import ACTION
 from numpy.typing import NDArray
 
-from lerobot_cqn.errors import DataError
+from lerobot_cqn.errors import ConfigError, DataError
 
 from .interfaces import Frame, Outcome
 
@@ -23,7 +23,10 @@ class GymEnvironment:
     """One environment made by LeRobot's factory, with LeRobot's observation names and processors."""
 
     def __init__(self, config: EnvConfig, policy_config: PreTrainedConfig) -> None:
-        suites = make_env(config, n_envs=1)
+        try:
+            suites = make_env(config, n_envs=1)
+        except ImportError as error:
+            raise ConfigError(f"The environment '{config.type}' is not installed: {error}") from error
         vectors = [vector for tasks in suites.values() for vector in tasks.values()]
         if len(vectors) != 1:
             raise DataError(f"Expected one task, '{config.type}' made {len(vectors)}: name one with `--env.task=`.")

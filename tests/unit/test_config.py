@@ -1,0 +1,174 @@
+"""Presets, overrides, and a config that survives being saved."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import draccus
+import pytest
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.types import FeatureType, PolicyFeature
+
+import cqn_train.envs  # noqa: F401  # registers the station
+from cqn_train.config import RunConfig
+from lerobot_cqn import settings as settings_module
+from lerobot_cqn.configuration_cqn import CQNConfig
+from lerobot_cqn.errors import ConfigError
+from lerobot_cqn.settings import PRESETS, CQNSettings
+
+STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (3,))}
+ACTION = {"action": PolicyFeature(FeatureType.ACTION, (2,))}
+
+
+def config(**settings: Any) -> CQNConfig:
+    return CQNConfig(device="cpu", **settings)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_are_the_defaults_with_their_column_on_top(preset: str) -> None:
+    expected = {**asdict(CQNSettings()), **PRESETS[preset]}
+    assert asdict(config(preset=preset).settings) == expected
+
+
+@pytest.mark.parametrize(
+    ("preset", "expected"),
+    [
+        ("paper_rlbench", {"frame_stack": 8, "levels": 3, "bins": 5, "n_step": 3, "v_min": -1, "v_max": 1}),
+        ("paper_rlbench", {"atoms": 51, "rl_loss_scale": 0.1, "bc_loss_scale": 1, "lr": 5e-5, "weight_decay": 0.1}),
+        ("paper_rlbench", {"tau": 0.02, "exploration_noise": 0.01, "hidden_dim": 512, "feature_dim": 64}),
+        ("paper_real_world", {"frame_stack": 4, "levels": 4, "bins": 3, "rl_loss_scale": 0.1, "shift_pixels": 4}),
+        ("paper_dmc_state", {"frame_stack": 1, "v_min": 0, "v_max": 200, "exploration_noise": 0.1}),
+        ("paper_dmc_pixels", {"frame_stack": 3, "bc_loss_scale": 0, "rl_loss_scale": 1}),
+        ("reference_rlbench", {"n_step": 1, "v_min": -2, "v_max": 2, "action_margin": 0.2, "frame_stack": 8}),
+    ],
+)
+def test_published_numbers(preset: str, expected: dict[str, float]) -> None:
+    found = asdict(config(preset=preset).settings)
+    assert {name: found[name] for name in expected} == expected
+
+
+def test_what_is_given_replaces_the_preset() -> None:
+    settings = config(preset="paper_real_world", levels=2, rl_loss_scale=0.0, encoder_channels=[4, 8]).settings
+    assert (settings.levels, settings.bins, settings.rl_loss_scale) == (2, 3, 0.0)
+    assert settings.encoder_channels == (4, 8)
+
+
+def test_unknown_presets_suggest_a_known_one() -> None:
+    with pytest.raises(ConfigError, match=r"Unknown preset 'paper_rlbnch'.*Did you mean 'paper_rlbench'\?"):
+        config(preset="paper_rlbnch")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("levels", 0, "`levels` must be at least 1, got 0"),
+        ("bins", 1, "`bins` must be at least 2, got 1"),
+        ("atoms", 1, "`atoms` must be at least 2"),
+        ("n_step", 0, "`n_step` must be at least 1"),
+        ("frame_stack", 0, "`frame_stack` must be at least 1"),
+        ("tau", 0.0, r"`tau` must be in \(0, 1\], got 0"),
+        ("discount", 1.1, r"`discount` must be in \(0, 1\], got 1.1"),
+        ("discount", float("nan"), "`discount`"),
+        ("lr", 0.0, "`lr` must be positive"),
+        ("state_bound", 0.5, "`state_bound` must be at least 1"),
+        ("v_max", -1.0, "`v_min` must be below `v_max`"),
+        ("encoder_channels", (), "`encoder_channels` must be positive"),
+        ("encoder_channels", (8, 0), "`encoder_channels` must be positive"),
+        ("act_with", "targt", r"Did you mean 'target'\?"),
+        ("next_action_from", "both", "online, target"),
+        ("bc_margin", -0.1, "`bc_margin` must be at least 0"),
+        ("exploration_noise", -1.0, "`exploration_noise` must be at least 0"),
+    ],
+)
+def test_values_out_of_range_are_named(name: str, value: Any, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        config(**{name: value})
+
+
+def test_something_must_be_learned() -> None:
+    with pytest.raises(ConfigError, match="Nothing to learn"):
+        config(rl_loss_scale=0, bc_loss_scale=0)
+
+
+def test_offsets_that_are_loaded() -> None:
+    paper = config()  # S = 8, n = 3
+    assert paper.observation_delta_indices == list(range(-7, 4))
+    assert len(paper.observation_delta_indices) == 11
+    assert paper.action_delta_indices == [0]
+    assert paper.reward_delta_indices == [0, 1, 2]
+    assert config(frame_stack=1, n_step=3).observation_delta_indices == [0, 3]
+    assert config(frame_stack=2, n_step=1).observation_delta_indices == [-1, 0, 1]
+    assert config(rl_loss_scale=0.0).observation_delta_indices == list(range(-7, 1))
+
+
+def test_a_saved_config_holds_every_number_and_reads_back(tmp_path: Path) -> None:
+    original = config(preset="laptop_pixels", input_features=STATE, output_features=ACTION, levels=2, n_step=2)
+    original.save_pretrained(tmp_path)
+    written = json.loads((tmp_path / "config.json").read_text())
+    assert written["type"] == "cqn"
+    for name, value in asdict(original.settings).items():
+        assert written[name] == (list(value) if isinstance(value, tuple) else value)
+    loaded = PreTrainedConfig.from_pretrained(str(tmp_path))
+    assert isinstance(loaded, CQNConfig)
+    assert loaded.settings == original.settings
+    assert loaded.input_features == original.input_features
+    assert loaded.normalization_mapping == original.normalization_mapping
+    again = PreTrainedConfig.from_pretrained(str(tmp_path), cli_overrides=["--levels=4"])
+    assert isinstance(again, CQNConfig)
+    assert (again.settings.levels, again.settings.n_step) == (4, 2)
+
+
+def test_a_later_change_of_a_preset_leaves_checkpoints_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    original = config(preset="laptop_state")
+    original.save_pretrained(tmp_path)
+    monkeypatch.setitem(settings_module.PRESETS, "laptop_state", {"frame_stack": 5, "hidden_dim": 7})
+    loaded = PreTrainedConfig.from_pretrained(str(tmp_path))
+    assert isinstance(loaded, CQNConfig)
+    assert loaded.settings == original.settings
+
+
+def test_features_are_checked() -> None:
+    with pytest.raises(ConfigError, match=r"Nothing to observe.*found \[\]"):
+        config(output_features=ACTION).validate_features()
+    with pytest.raises(ConfigError, match="Expected one action vector under 'action', found None"):
+        config(input_features=STATE).validate_features()
+    picture = {"observation.images.top": PolicyFeature(FeatureType.VISUAL, (64, 64, 3))}
+    with pytest.raises(ConfigError, match=r"shape \(3, height, width\), found \(64, 64, 3\)"):
+        config(input_features=picture, output_features=ACTION).validate_features()
+    config(input_features=STATE, output_features=ACTION).validate_features()
+
+
+def test_lerobots_optimiser_is_the_papers() -> None:
+    settings = config()
+    optimiser = settings.get_optimizer_preset()
+    assert (optimiser.lr, optimiser.weight_decay, optimiser.grad_clip_norm) == (5e-5, 0.1, 0.0)
+    assert settings.get_scheduler_preset() is None
+
+
+def test_the_schedule_follows_the_policys_preset() -> None:
+    def schedule(*arguments: str) -> dict[str, int]:
+        return draccus.parse(RunConfig, args=["--policy.type=cqn", "--policy.device=cpu", *arguments]).schedule
+
+    assert schedule() == {
+        "updates_per_step": 1, "updates_per_episode": 0, "batch_size": 256, "demo_batch_size": 256,
+    }  # fmt: skip
+    assert schedule("--policy.preset=paper_real_world")["updates_per_episode"] == 50
+    assert schedule("--policy.preset=paper_dmc_state")["demo_batch_size"] == 0
+    mixed = schedule("--policy.preset=paper_real_world", "--batch_size=8", "--updates_per_step=2")
+    assert mixed == {"updates_per_step": 2, "updates_per_episode": 50, "batch_size": 8, "demo_batch_size": 256}
+
+
+def test_runs_are_checked() -> None:
+    def validate(*arguments: str) -> None:
+        policy = ["--policy.type=cqn", "--policy.device=cpu"]
+        rest = ["--env.type=ur5e_station", "--output_dir=x", "--dataset.repo_id=a/b"]
+        draccus.parse(RunConfig, args=[*policy, *rest, *arguments]).validate()
+
+    validate()
+    for option in ("steps", "offline_updates", "seed", "threads", "batch_size", "updates_per_step"):
+        with pytest.raises(ConfigError, match=f"`{option}` must be at least 0, got -1"):
+            validate(f"--{option}=-1")
+    for option in ("save_freq", "log_freq"):
+        with pytest.raises(ConfigError, match=f"`{option}` must be at least 1, got 0"):
+            validate(f"--{option}=0")

@@ -1,0 +1,285 @@
+"""Acting, the target critic, the learner, and what each setting changes."""
+
+from copy import deepcopy
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from lerobot_cqn.critic import CQNModel
+from lerobot_cqn.intervals import snap
+from lerobot_cqn.learner import Learner, NonFiniteLossError
+from lerobot_cqn.losses import margin_loss
+from lerobot_cqn.schema import Batch, Observation
+from lerobot_cqn.settings import CQNSettings
+
+from .test_oracle import P, build, random_batch
+
+
+def weights(model: CQNModel) -> dict[str, Tensor]:
+    return {name: value.clone() for name, value in model.state_dict().items()}
+
+
+def new_critic(**changes: object) -> CQNModel:
+    settings = CQNSettings(frame_stack=1, hidden_dim=16, feature_dim=8, **changes)  # type: ignore[arg-type]
+    return CQNModel({}, P, 4, settings)
+
+
+# -- acting --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("levels", "bins"), [(1, 17), (3, 5), (4, 3), (2, 4)])
+def test_actions_are_deterministic_bounded_and_representable(levels: int, bins: int) -> None:
+    model = build(1, P, 4, levels=levels, bins=bins)
+    observation = random_batch(model, 1, P).observation
+    action, q = model.act(observation)
+    assert action.shape == (6, 4)
+    assert q.shape == (6,)
+    assert action.abs().max() <= 1
+    assert torch.equal(action, snap(action, levels, bins))
+    again, q_again = model.act(observation)
+    assert torch.equal(action, again)
+    assert torch.equal(q, q_again)
+
+
+def test_batch_size_does_not_change_the_action() -> None:
+    model = build(1, P, 4)
+    observation = random_batch(model, 1, P).observation
+    assert observation.low_dim is not None
+    alone = Observation(tuple(view[:1] for view in observation.pixels), observation.low_dim[:1])
+    assert torch.equal(model.act(alone)[0], model.act(observation)[0][:1])
+
+
+def test_new_critic_explores_every_bin_and_is_deterministic_otherwise() -> None:
+    model = new_critic(levels=2, bins=3)
+    observation = Observation((), torch.randn(400, P))
+    torch.manual_seed(0)
+    explored, _ = model.act(observation, explore=True)
+    values, counts = explored.unique(return_counts=True)
+    assert len(values) == 9
+    assert counts.min() > 120  # 1600 choices over 9 actions
+    first, q = model.act(observation)
+    assert torch.equal(first, model.act(observation)[0])
+    assert len(first.unique()) == 1
+    assert torch.allclose(q, torch.zeros(400), atol=1e-6)  # uniform over [-1, 1]
+
+
+def test_exploring_keeps_clear_preferences() -> None:
+    model = build(0, P, 4)
+    observation = random_batch(model, 0, P).observation
+    assert torch.equal(model.act(observation, explore=True)[0], model.act(observation)[0])
+
+
+def test_random_bins_can_be_switched_off() -> None:
+    model = new_critic(random_bin_below=0.0)
+    assert len(model.act(Observation((), torch.randn(50, P)), explore=True)[0].unique()) == 1
+
+
+@pytest.mark.parametrize(("act_with", "used", "unused"), [
+    ("target", "target_critic", "critic"), ("online", "critic", "target_critic"),
+])  # fmt: skip
+def test_act_with_names_the_critic_that_acts(act_with: str, used: str, unused: str) -> None:
+    model = build(0, P, 4, act_with=act_with)
+    observation = random_batch(model, 0, P).observation
+    action, _ = model.act(observation)
+
+    def disturb(critic: str) -> Tensor:
+        with torch.no_grad():
+            for stream in (getattr(model, critic).advantage, getattr(model, critic).value):
+                stream.head.weight.neg_()
+                stream.head.bias.neg_()
+        return model.act(observation)[0]
+
+    assert torch.equal(disturb(unused), action)
+    assert not torch.equal(disturb(used), action)
+
+
+# -- speed options -------------------------------------------------------------------------------------------
+
+
+def test_channels_last_gives_the_same_results() -> None:
+    plain, last = build(2, P, 3, channels_last=False), build(2, P, 3, channels_last=True)
+    batch = random_batch(plain, 2, P)
+    assert torch.equal(plain.act(batch.observation)[0], last.act(batch.observation)[0])
+    first, _ = plain.loss(batch)
+    second, _ = last.loss(batch)
+    assert float(first) == pytest.approx(float(second), rel=1e-5)
+
+
+def test_bf16_gives_close_results() -> None:
+    plain, half = build(1, P, 3), build(1, P, 3, bf16=True)
+    batch = random_batch(plain, 1, P, "all")
+    loss, _ = plain.loss(batch)
+    half_loss, _ = half.loss(batch)
+    assert half_loss.dtype == torch.float32
+    assert float(half_loss) == pytest.approx(float(loss), rel=0.05)
+    loss.backward()  # type: ignore[no-untyped-call]
+    half_loss.backward()  # type: ignore[no-untyped-call]
+    pairs = [(a.grad, b.grad) for a, b in zip(plain.parameters(), half.parameters(), strict=True) if a.requires_grad]
+    first = torch.cat([a.flatten() for a, _ in pairs if a is not None])
+    second = torch.cat([b.flatten() for _, b in pairs if b is not None])
+    assert torch.cosine_similarity(first, second, dim=0) > 0.95
+
+
+# -- learning ------------------------------------------------------------------------------------------------
+
+
+def test_target_moves_by_tau_exactly() -> None:
+    model = build(0, P, 2, tau=0.25)
+    before = weights(model)
+    model.update_target()
+    for name, value in model.state_dict().items():
+        expected = before[name]
+        if name.startswith("target_critic."):
+            expected = 0.75 * before[name] + 0.25 * before[name.removeprefix("target_")]
+        assert torch.allclose(value, expected, atol=1e-7, rtol=1e-6), name
+
+
+def test_new_target_equals_the_online_critic() -> None:
+    model = new_critic()
+    for (name, online), target in zip(model.critic.named_parameters(), model.target_critic.parameters(), strict=True):
+        assert torch.equal(online, target), name
+        assert not target.requires_grad
+
+
+@pytest.mark.parametrize("where", ["reward", "observation", "next_observation"])
+def test_non_finite_loss_leaves_everything_untouched(where: str) -> None:
+    model = build(0, P, 2)
+    learner = Learner(model)
+    good = random_batch(model, 0, P)
+    learner.update(good)
+    before, state = weights(model), learner.state_dict()["state"][0]["exp_avg"].clone()
+    nan = Observation((), torch.full((6, P), float("nan")))
+    broken: Batch = replace(good, **{where: torch.full((6, 1), float("nan")) if where == "reward" else nan})
+    with pytest.raises(NonFiniteLossError, match="finite"):
+        learner.update(broken)
+    for name, value in model.state_dict().items():
+        assert torch.equal(value, before[name]), name
+    assert torch.equal(learner.state_dict()["state"][0]["exp_avg"], state)
+    assert all(torch.isfinite(value) for value in learner.update(good).values())
+
+
+def test_learner_restores_its_state() -> None:
+    first, second = build(0, P, 2), build(0, P, 2)
+    batch = random_batch(first, 0, P)
+    learner, other = Learner(first), Learner(second)
+    learner.update(batch)
+    second.load_state_dict(first.state_dict())
+    other.load_state_dict(deepcopy(learner.state_dict()))  # torch shares the tensors it is given
+    learner.update(batch)
+    other.update(batch)
+    for name, value in first.state_dict().items():
+        assert torch.equal(value, second.state_dict()[name]), name
+
+
+def test_updates_lower_the_loss() -> None:
+    model = build(0, P, 2)
+    learner, batch = Learner(model), random_batch(model, 0, P)
+    losses = [float(learner.update(batch)["loss"]) for _ in range(60)]
+    assert losses[-1] < 0.5 * losses[0]
+
+
+def test_next_observation_gives_no_gradient() -> None:
+    model = build(0, P, 2, bc_loss_scale=0.0)
+    batch = random_batch(model, 0, P)
+    assert batch.next_observation.low_dim is not None
+    batch.next_observation.low_dim.requires_grad_()
+    model.loss(batch)[0].backward()  # type: ignore[no-untyped-call]
+    assert batch.next_observation.low_dim.grad is None
+    assert all(p.grad is None for p in model.target_critic.parameters())
+
+
+# -- each setting changes what it says ------------------------------------------------------------------------
+
+
+def stats(**changes: object) -> tuple[float, dict[str, float]]:
+    model = build(0, P, 2, **changes)
+    torch.manual_seed(1)
+    loss, parts = model.loss(random_batch(model, 0, P))
+    return float(loss), {name: float(value) for name, value in parts.items()}
+
+
+def test_loss_is_the_weighted_sum_of_its_parts() -> None:
+    loss, parts = stats(rl_loss_scale=0.7, bc_loss_scale=1.3)
+    expected = 0.7 * parts["rl_loss"] + 1.3 * (parts["bc_margin_loss"] + parts["bc_dominance_loss"])
+    assert loss == pytest.approx(expected, rel=1e-6)
+
+
+def test_rl_off_is_imitation_alone() -> None:
+    loss, parts = stats(rl_loss_scale=0.0, bc_loss_scale=1.0)
+    assert set(parts) == {"loss", "bc_margin_loss", "bc_dominance_loss"}
+    assert loss == pytest.approx(parts["bc_margin_loss"] + parts["bc_dominance_loss"])
+
+
+def test_imitation_off_is_rl_alone() -> None:
+    loss, parts = stats(rl_loss_scale=1.0, bc_loss_scale=0.0)
+    assert set(parts) == {"loss", "rl_loss"}
+    assert loss == pytest.approx(parts["rl_loss"])
+
+
+def test_dominance_off_leaves_the_margin() -> None:
+    _, with_dominance = stats()
+    _, without = stats(bc_dominance=False)
+    assert "bc_dominance_loss" not in without
+    assert without["bc_margin_loss"] == with_dominance["bc_margin_loss"]
+
+
+def test_scalar_critic_has_one_output_per_bin_and_no_dominance() -> None:
+    model = build(0, P, 2, distributional=False)
+    assert model.critic.advantage.head.out_features == 2 * model.settings.bins
+    assert "bc_dominance_loss" not in stats(distributional=False)[1]
+
+
+def test_margin_is_the_one_given() -> None:
+    small, large = stats(bc_margin=0.01)[1], stats(bc_margin=5.0)[1]
+    # With a margin beyond every difference the loss is linear in it.
+    assert large["bc_margin_loss"] > small["bc_margin_loss"] + 4
+    q = torch.tensor([0.0, 1.0]).view(1, 1, 1, 2)
+    assert margin_loss(q, torch.ones(1, 1, 1, dtype=torch.int64), 3.0).item() == pytest.approx((3 + 2) / 2)
+
+
+def test_next_action_is_chosen_by_the_critic_named() -> None:
+    """Scalar values: what equation 2 maximises is at least the double-Q value, level by level."""
+    online, target = (build(0, P, 2, next_action_from=name, distributional=False, levels=1)
+                      for name in ("online", "target"))  # fmt: skip
+    batch = random_batch(online, 0, P)
+    arguments = (online.encode(batch.next_observation), batch.reward, torch.ones(6, 1))
+    double, maximum = online.td_target(*arguments), target.td_target(*arguments)
+    assert (maximum >= double - 1e-6).all()
+    assert (maximum > double + 1e-3).any()
+
+
+def test_levels_bins_and_stack_size_the_network() -> None:
+    model = build(1, P, 2, levels=4, bins=3, frame_stack=2)
+    assert model.critic.advantage.head.out_features == 2 * 3 * model.settings.atoms
+    assert model.critic.value.head.out_features == 2 * model.settings.atoms
+    assert model.critic.advantage.first.in_features == 8 + 8 + 2 + 4
+    assert model.encoders[0].convolutions[0].in_channels == 6
+    assert model.critic.advantage.low_dim_projection[0].in_features == 2 * P
+
+
+def test_value_range_is_the_support() -> None:
+    model = build(0, P, 2, v_min=0.0, v_max=200.0)
+    assert model.support[[0, -1]].tolist() == [0, 200]
+    q = model.act(random_batch(model, 0, P).observation)[1]
+    assert q.min() >= 0
+    assert q.max() <= 200
+
+
+def test_optimiser_uses_the_settings_and_leaves_the_target_out() -> None:
+    model = build(1, P, 2, lr=0.02, weight_decay=0.3)
+    learner = Learner(model)
+    (group,) = learner.optimizer.param_groups
+    assert (group["lr"], group["weight_decay"]) == (0.02, 0.3)
+    held = {id(parameter) for parameter in group["params"]}
+    assert {id(p) for p in model.encoders.parameters()} | {id(p) for p in model.critic.parameters()} == held
+
+
+def test_augmentation_is_part_of_the_update_only() -> None:
+    model = build(1, 0, 2, shift_pixels=4)
+    observation = random_batch(model, 1, 0).observation
+    assert torch.equal(model.act(observation)[0], model.act(observation)[0])
+    assert not torch.equal(model.augment(observation).pixels[0], observation.pixels[0])
+    jittered = build(1, 0, 2, brightness=0.2).augment(observation).pixels[0]
+    assert jittered.is_floating_point()

@@ -1,0 +1,232 @@
+"""The replay against a loop that takes one step after the other."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cqn_train.replay import Episode, Replay
+from lerobot_cqn.errors import DataError
+from lerobot_cqn.schema import Batch
+
+P, D, SIDE, GAMMA = 2, 3, 4, 0.9
+
+
+def make_episode(number: int, length: int, *, terminated: bool = True, views: int = 0) -> Episode:
+    """Numbers that tell where they come from: frame t of episode e holds 100 e + t, its action 1 / (100 e + t + 1)."""
+    marks = 100 * number + np.arange(length + 1)
+    rng = np.random.default_rng(number)
+    return Episode(
+        np.stack([marks, -marks], axis=1).astype(np.float32),
+        tuple(
+            np.broadcast_to((view + marks % 251)[:, None, None, None], (length + 1, 3, SIDE, SIDE)).astype(np.uint8)
+            for view in range(views)
+        ),
+        np.repeat(1 / (marks[:-1, None] + 1.0), D, axis=1).astype(np.float32),
+        rng.normal(size=length).astype(np.float32),
+        terminated,
+        terminated,
+    )
+
+
+def oracle(episode: Episode, t: int, stack: int, n: int) -> tuple[list[int], float, float, list[int]]:
+    """Frames of the observation, n-step reward, discount, and frames of the observation to bootstrap from."""
+    now = [max(t - back, 0) for back in reversed(range(stack))]
+    reward, discount, at = 0.0, 1.0, t
+    for _ in range(n):
+        reward += discount * float(episode.reward[at])
+        discount *= GAMMA
+        at += 1
+        if at == len(episode):
+            if episode.terminated:
+                discount = 0.0
+            break
+    return now, reward, discount, [max(at - back, 0) for back in reversed(range(stack))]
+
+
+def locate(batch: Batch, row: int) -> tuple[int, int]:
+    """Episode and step of a sample, read off its action."""
+    mark = round(1 / float(batch.action[row, 0])) - 1
+    return mark // 100, mark % 100
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    lengths=st.lists(st.tuples(st.integers(1, 12), st.booleans()), min_size=1, max_size=5),
+    stack=st.integers(1, 5),
+    n=st.integers(1, 6),
+    views=st.integers(0, 2),
+)
+def test_samples_are_those_of_a_plain_loop(lengths: list[tuple[int, bool]], stack: int, n: int, views: int) -> None:
+    episodes = [make_episode(i, length, terminated=end, views=views) for i, (length, end) in enumerate(lengths)]
+    replay = Replay(stack, n, GAMMA)
+    for episode in episodes:
+        replay.add(episode, demo=episode.success)
+    batch = replay.sample(64, 0, np.random.default_rng(0))
+    assert batch.reward.shape == batch.discount.shape == batch.demo.shape == (64, 1)
+    for row in range(64):
+        number, t = locate(batch, row)
+        episode = episodes[number]
+        now, reward, discount, later = oracle(episode, t, stack, n)
+        assert float(batch.reward[row]) == pytest.approx(reward, abs=1e-5)
+        assert float(batch.discount[row]) == pytest.approx(discount, abs=1e-6)
+        assert float(batch.demo[row]) == episode.success
+        for observation, frames in ((batch.observation, now), (batch.next_observation, later)):
+            assert observation.low_dim is not None
+            assert episode.low_dim is not None
+            np.testing.assert_array_equal(observation.low_dim[row].numpy(), episode.low_dim[frames].reshape(-1))
+            assert len(observation.pixels) == views
+            for view, stored in zip(observation.pixels, episode.pixels, strict=True):
+                assert view.dtype == torch.uint8
+                np.testing.assert_array_equal(view[row].numpy(), stored[frames].reshape(3 * stack, SIDE, SIDE))
+
+
+def test_every_step_is_reached() -> None:
+    replay = Replay(1, 3, GAMMA)
+    for number, length in enumerate((1, 4, 2)):
+        replay.add(make_episode(number, length), demo=True)
+    batch = replay.sample(400, 0, np.random.default_rng(1))
+    assert {locate(batch, row) for row in range(400)} == {(0, 0), *((1, t) for t in range(4)), (2, 0), (2, 1)}
+
+
+def test_a_time_limit_bootstraps_from_its_own_last_observation() -> None:
+    replay = Replay(1, 3, GAMMA)
+    replay.add(make_episode(0, 2, terminated=False), demo=False)
+    replay.add(make_episode(1, 5), demo=True)
+    batch = replay.sample(50, 0, np.random.default_rng(0))
+    cut = [row for row in range(50) if locate(batch, row)[0] == 0]
+    assert cut
+    assert batch.next_observation.low_dim is not None
+    for row in cut:
+        assert batch.next_observation.low_dim[row, 0] == 2  # frame T, not the first one of the next episode
+        assert float(batch.discount[row]) == pytest.approx(GAMMA ** (2 - locate(batch, row)[1]))
+
+
+def test_uniform_over_episodes_then_over_steps() -> None:
+    """Whole episodes weigh the same, however long: chi-square at the 0.1 % level, with a fixed seed."""
+    lengths = (2, 40, 9, 1)
+    replay = Replay(1, 1, GAMMA)
+    for number, length in enumerate(lengths):
+        replay.add(make_episode(number, length), demo=number < 2)
+    count = 20_000
+    batch = replay.sample(count, count, np.random.default_rng(5))
+    places = [locate(batch, row) for row in range(2 * count)]
+    everything = np.bincount([episode for episode, _ in places[:count]], minlength=4)
+    assert ((everything - count / 4) ** 2 / (count / 4)).sum() < 16.27  # 3 degrees of freedom
+    demos = np.bincount([episode for episode, _ in places[count:]], minlength=4)
+    assert demos[2:].sum() == 0
+    assert ((demos[:2] - count / 2) ** 2 / (count / 2)).sum() < 10.83  # 1 degree of freedom
+    steps = np.bincount([step for episode, step in places[:count] if episode == 1], minlength=40)
+    expected = everything[1] / 40
+    assert ((steps - expected) ** 2 / expected).sum() < 73  # 39 degrees of freedom
+
+
+def test_demonstrations_come_last_and_are_flagged() -> None:
+    replay = Replay(1, 1, GAMMA)
+    replay.add(make_episode(0, 3), demo=True)
+    replay.add(make_episode(1, 3), demo=False)
+    replay.add(make_episode(2, 3), demo=True)  # a relabelled success
+    assert (replay.episodes, replay.demonstrations, replay.steps) == (3, 2, 9)
+    batch = replay.sample(60, 40, np.random.default_rng(0))
+    flags = batch.demo[:, 0].bool()
+    assert flags[60:].all()
+    assert not flags[:60].all()
+    assert [locate(batch, row)[0] != 1 for row in range(100)] == flags.tolist()
+
+
+def test_the_same_generator_draws_the_same_batch() -> None:
+    replay = Replay(2, 3, GAMMA)
+    replay.add(make_episode(0, 30), demo=True)
+    one, other = (replay.sample(16, 16, np.random.default_rng(7)) for _ in range(2))
+    assert torch.equal(one.action, other.action)
+    assert torch.equal(one.reward, other.reward)
+
+
+@pytest.mark.parametrize("first", [0, 1, 3])
+def test_what_is_saved_comes_back(first: int, tmp_path: Path) -> None:
+    episodes = [make_episode(i, length, terminated=i != 1, views=2) for i, length in enumerate((3, 1, 1200, 2))]
+    original, copy = Replay(2, 3, GAMMA), Replay(2, 3, GAMMA)
+    for number, episode in enumerate(episodes):
+        original.add(episode, demo=number != 2)
+        if number < first:
+            copy.add(episode, demo=number != 2)
+    original.save(tmp_path / "episodes.npz", first)
+    copy.load(tmp_path / "episodes.npz")
+    assert (copy.episodes, copy.steps) == (original.episodes, original.steps)
+    assert copy.demonstrations == original.demonstrations
+    a, b = (replay.sample(40, 40, np.random.default_rng(0)) for replay in (original, copy))
+    for name in ("action", "reward", "discount", "demo"):
+        assert torch.equal(getattr(a, name), getattr(b, name))
+    for one, other in ((a.observation, b.observation), (a.next_observation, b.next_observation)):
+        assert torch.equal(one.low_dim, other.low_dim)  # type: ignore[arg-type]
+        assert all(torch.equal(x, y) for x, y in zip(one.pixels, other.pixels, strict=True))
+
+
+def test_nothing_new_is_saved_as_nothing(tmp_path: Path) -> None:
+    original, copy = Replay(1, 1, GAMMA), Replay(1, 1, GAMMA)
+    original.add(make_episode(0, 3), demo=True)
+    original.save(tmp_path / "episodes.npz", 1)
+    copy.load(tmp_path / "episodes.npz")
+    assert copy.episodes == 0
+
+
+def test_pixels_without_state(tmp_path: Path) -> None:
+    filmed = make_episode(0, 4, views=1)
+    blind = Episode(None, filmed.pixels, filmed.action, filmed.reward, True, True)
+    replay, copy = Replay(2, 1, GAMMA), Replay(2, 1, GAMMA)
+    replay.add(blind, demo=True)
+    replay.save(tmp_path / "episodes.npz")
+    copy.load(tmp_path / "episodes.npz")
+    for stored in (replay, copy):
+        batch = stored.sample(4, 0, np.random.default_rng(0))
+        assert batch.observation.low_dim is None
+        assert batch.observation.pixels[0].shape == (4, 6, SIDE, SIDE)
+
+
+def test_growing_keeps_what_was_there() -> None:
+    replay = Replay(1, 1, GAMMA)
+    for number in range(60):
+        replay.add(make_episode(number, 50), demo=False)
+    batch = replay.sample(500, 0, np.random.default_rng(0))
+    assert batch.observation.low_dim is not None
+    for row in range(500):
+        number, step = locate(batch, row)
+        assert batch.observation.low_dim[row, 0] == 100 * number + step
+
+
+@pytest.mark.parametrize(("count", "demo_count"), [(4, 0), (0, 4)])
+def test_empty_stores_are_named(count: int, demo_count: int) -> None:
+    replay = Replay(1, 1, GAMMA)
+    if demo_count:
+        replay.add(make_episode(0, 3), demo=False)
+    with pytest.raises(DataError, match=r"Cannot sample .* 0 are demonstrations; give a dataset"):
+        replay.sample(count, demo_count, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("where", ["low_dim", "action", "reward"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_values_that_are_not_finite_never_enter(where: str, value: float) -> None:
+    replay = Replay(1, 1, GAMMA)
+    episode = make_episode(0, 3)
+    getattr(episode, where).flat[1] = value
+    with pytest.raises(DataError, match="NaN or infinite"):
+        replay.add(episode, demo=True)
+    assert replay.episodes == 0
+
+
+def test_shapes_must_fit_and_steps_must_exist() -> None:
+    replay = Replay(1, 1, GAMMA)
+    empty = make_episode(0, 0)
+    with pytest.raises(DataError, match="at least one step"):
+        replay.add(empty, demo=True)
+    replay.add(make_episode(0, 3, views=1), demo=True)
+    other = make_episode(1, 3, views=1)
+    wide = Episode(other.low_dim, other.pixels, other.action[:, :2], other.reward, True, True)
+    with pytest.raises(DataError, match="do not fit"):
+        replay.add(wide, demo=True)
+    blurred = Episode(other.low_dim, (other.pixels[0][..., :2],), other.action, other.reward, True, True)
+    with pytest.raises(DataError, match="do not fit"):
+        replay.add(blurred, demo=True)
