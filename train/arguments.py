@@ -1,0 +1,147 @@
+"""The command line of `cqn-train`: from arguments to settings, and from a mistake to one line about it."""
+
+import contextlib
+import io
+import logging
+import re
+from collections.abc import Sequence
+from dataclasses import fields
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import draccus
+from draccus.utils import DecodingError, ParsingError
+from huggingface_hub.errors import HfHubHTTPError, HFValidationError
+from lerobot.configs import parser
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.envs.configs import EnvConfig
+
+from lerobot_cqn.configuration_cqn import CQNConfig
+from lerobot_cqn.errors import ConfigError, CQNError, one_of
+
+from .checkpoint import last_checkpoint
+from .config import DatasetSettings, EvalSettings, RunConfig, WandBSettings
+
+__all__ = ["EXAMPLES", "parse"]
+
+logger = logging.getLogger(__name__)
+
+EXAMPLES = """\
+Train a Coarse-to-fine Q-Network from demonstrations, then online.
+
+  demonstrations, then online in the simulated station:
+    cqn-train --policy.type=cqn --policy.preset=laptop_state --env.type=ur5e_station --env.task=click_button \\
+      --dataset.repo_id=local/click --dataset.root=data/click --offline_updates=2000 --steps=5000 \\
+      --output_dir=outputs/click
+
+  continue after Ctrl-C or a crash:          cqn-train --resume=true --output_dir=outputs/click
+  start from a trained policy:               cqn-train --policy.path=outputs/click/checkpoints/last/pretrained_model ...
+  imitation only (the paper's CBC):          cqn-train --policy.rl_loss_scale=0 --steps=0 --offline_updates=5000 ...
+  evaluate with LeRobot:                     lerobot-eval --policy.path=.../pretrained_model --env.type=ur5e_station
+
+Add --env.type=... or --policy.type=cqn before --help to see their options; --debug shows tracebacks.
+"""
+
+
+def parse(arguments: Sequence[str]) -> RunConfig:
+    """Run settings from the command line. Raises ConfigError for anything that does not parse."""
+    arguments = list(arguments)
+    config_file: str | None = None
+    if _flag(arguments, "resume"):
+        output_dir = parser.parse_arg("output_dir", arguments)
+        if output_dir is None:
+            raise ConfigError("--resume needs the run's folder: give --output_dir=DIR.")
+        config_file = str(last_checkpoint(Path(output_dir)) / "pretrained_model" / "train_config.json")
+    config_file = parser.parse_arg("config_path", arguments) or config_file
+    arguments = parser.filter_arg("config_path", arguments)
+    path = parser.parse_arg("policy.path", arguments)
+    overrides = [a.replace("--policy.", "--", 1) for a in arguments if a.startswith("--policy.")]
+    if path is not None:
+        arguments = [a for a in arguments if not a.startswith("--policy.")]
+        overrides = [a for a in overrides if not a.startswith("--path")]
+    for kind in ("policy", "env"):
+        settings = [a for a in arguments if a.startswith(f"--{kind}.")]
+        if settings and config_file is None and parser.parse_arg(f"{kind}.type", arguments) is None:
+            raise ConfigError(f"{settings[0]} needs to know of which {kind}: give --{kind}.type=... as well.")
+    complaint = io.StringIO()  # argparse prints pages of usage before it says what is wrong
+    try:
+        with contextlib.redirect_stderr(complaint):
+            config: RunConfig = draccus.parse(RunConfig, config_path=config_file, args=arguments)
+        if path is not None:
+            with contextlib.redirect_stderr(complaint):
+                config.policy = _pretrained_config(path, overrides)
+    except CQNError:
+        raise
+    except SystemExit as error:
+        raise ConfigError(_option_error(complaint.getvalue(), arguments)) from error
+    except Exception as error:  # draccus raises many kinds
+        raise ConfigError(_user_cause(error)) from error
+    wanted = parser.parse_arg("device", overrides)
+    if wanted and config.policy and config.policy.device != wanted:
+        logger.warning("The device '%s' is not available: using '%s'.", wanted, config.policy.device)
+    return config
+
+
+def _pretrained_config(path: str, overrides: list[str]) -> PreTrainedConfig:
+    """Config of a trained policy, from a folder or the Hub, with the command line's values on top."""
+    if Path(path).exists() and not (Path(path) / "config.json").is_file():
+        raise ConfigError(f"No policy in {path}: expected config.json; give the `pretrained_model` folder.")
+    try:
+        policy: PreTrainedConfig = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+    except (OSError, HfHubHTTPError, HFValidationError) as error:  # no such folder, and the Hub knows nothing of it
+        raise ConfigError(
+            f"No policy at {path}: expected a `pretrained_model` folder (or user/name on the Hub, which could not be "
+            "reached or has no such policy); check --policy.path."
+        ) from error
+    policy.pretrained_path = Path(path)
+    return policy
+
+
+def _flag(arguments: Sequence[str], name: str) -> bool:
+    value: Any = parser.parse_arg(name, list(arguments))
+    return str(value).lower() in ("true", "1", "yes")
+
+
+def _user_cause(error: BaseException) -> str:
+    """What a person can act on: a config's own check where there was one, else the field that did not parse."""
+    chain: list[BaseException] = []
+    cause: BaseException | None = error
+    while cause is not None and cause not in chain:
+        chain.append(cause)
+        cause = cause.__cause__ or cause.__context__
+    ours = [e for e in chain if isinstance(e, CQNError)]
+    parsing = [e for e in chain if isinstance(e, DecodingError | ParsingError)]
+    wrapped = parsing and str(parsing[-1]).startswith("Couldn't instantiate")  # a check of LeRobot's own
+    said = (ours or ([] if wrapped else parsing[-1:]) or chain[-1:])[0]
+    return str(said) or type(said).__name__
+
+
+def _option_error(complaint: str, arguments: Sequence[str]) -> str:
+    """Argparse's pages in one line, with the nearest option or choice."""
+    text = (complaint.strip().splitlines() or ["unreadable options"])[-1].partition("error: ")[2]
+    choice = re.search(r"argument (\S+): invalid choice: '(.*?)' \(choose from (.*)\)", text)
+    if choice:
+        return one_of(f"value of {choice[1]}", choice[2], re.findall(r"[\w.-]+", choice[3]))
+    unknown = re.search(r"unrecognized arguments: (\S+)", text)
+    if unknown is None:
+        return f"{text} (--help lists all options)"
+    name = unknown[1].partition("=")[0]
+    if not any(a.startswith(name) for a in arguments):  # read as an override of a trained policy
+        name = name.replace("--", "--policy.", 1)
+    near = get_close_matches(name, _options(arguments), n=1)
+    hint = f" Did you mean '{near[0]}'?" if near else ""
+    return f"Unknown option '{name}': expected --name=value with a name that --help lists.{hint}"
+
+
+def _options(arguments: Sequence[str]) -> list[str]:
+    """Every option there is for the chosen environment."""
+    groups: dict[str, type] = {
+        "": RunConfig, "policy.": CQNConfig, "dataset.": DatasetSettings, "eval.": EvalSettings,
+        "wandb.": WandBSettings,
+    }  # fmt: skip
+    env = parser.parse_arg("env.type", list(arguments))
+    if env in EnvConfig.get_known_choices():
+        groups["env."] = EnvConfig.get_choice_class(env)
+    names = [f"--{group}{field.name}" for group, config in groups.items() for field in fields(config)]
+    return [*names, "--policy.type", "--policy.path", "--env.type"]
