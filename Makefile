@@ -17,10 +17,10 @@ demo: ## see it work: a small training run with its report, in outputs/demo
 	@$(RUN) .venv/bin/python -m cqn_train.demo --output_dir=outputs/demo $(ARGS)
 
 test: ## the fast tests
-	@$(RUN) .venv/bin/python -m pytest -n $(WORKERS) --dist loadgroup $(ARGS)
+	@$(RUN) .venv/bin/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
 
 slow: ## the tests that train for minutes
-	@$(RUN) .venv/bin/python -m pytest -m slow -n $(WORKERS) --dist loadgroup --timeout 3600 $(ARGS)
+	@$(RUN) .venv/bin/python -m pytest -m slow -n $(WORKERS) --dist loadfile --timeout 3600 $(ARGS)
 
 check: ## lint, formatting, types, import rules
 	@$(RUN) .venv/bin/python -m ruff check .

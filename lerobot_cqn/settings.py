@@ -62,18 +62,18 @@ class CQNSettings:
             "bc_loss_scale": 0, "bc_margin": 0, "exploration_noise": 0, "weight_decay": 0, "random_bin_below": 0,
         }  # fmt: skip
         for name, low in at_least.items():
-            if getattr(self, name) < low:
+            if not getattr(self, name) >= low:  # so that NaN is refused
                 raise ConfigError(f"`{name}` must be at least {low}, got {getattr(self, name)}.")
         for name in ("tau", "discount"):
             if not 0 < getattr(self, name) <= 1:
                 raise ConfigError(f"`{name}` must be in (0, 1], got {getattr(self, name)}.")
-        if self.lr <= 0:
+        if not self.lr > 0:
             raise ConfigError(f"`lr` must be positive, got {self.lr}.")
-        if self.state_bound < 1:
+        if not self.state_bound >= 1:
             raise ConfigError(
                 f"`state_bound` must be at least 1 (demonstrations span [-1, 1]), got {self.state_bound}."
             )
-        if self.v_min >= self.v_max:
+        if not self.v_min < self.v_max:
             raise ConfigError(f"`v_min` must be below `v_max`, got {self.v_min} and {self.v_max}.")
         if not self.encoder_channels or min(self.encoder_channels) < 1:
             raise ConfigError(f"`encoder_channels` must be positive numbers, got {self.encoder_channels}.")

@@ -94,6 +94,8 @@ def _pretrained_config(path: str, overrides: list[str]) -> PreTrainedConfig:
             f"No policy at {path}: expected a `pretrained_model` folder (or user/name on the Hub, which could not be "
             "reached or has no such policy); check --policy.path."
         ) from error
+    if any(override.startswith("--preset") for override in overrides):
+        raise ConfigError("A trained policy keeps its numbers: leave out --policy.preset, or give single fields.")
     policy.pretrained_path = Path(path)
     return policy
 

@@ -43,11 +43,13 @@ class _Rows:
         self._data: NDArray[Any] | None = None
         self.size = 0
 
+    def check(self, rows: NDArray[Any]) -> None:
+        if self._data is not None and rows.shape[1:] != self._data.shape[1:]:
+            raise DataError(f"Rows of shape {rows.shape[1:]} do not fit a replay of {self._data.shape[1:]}.")
+
     def append(self, rows: NDArray[Any]) -> None:
         if self._data is None:
             self._data = np.empty((max(1024, len(rows)), *rows.shape[1:]), rows.dtype)
-        if rows.shape[1:] != self._data.shape[1:]:
-            raise DataError(f"Rows of shape {rows.shape[1:]} do not fit a replay of {self._data.shape[1:]}.")
         if self.size + len(rows) > len(self._data):
             grown = np.empty((max(2 * len(self._data), self.size + len(rows)), *rows.shape[1:]), rows.dtype)
             grown[: self.size] = self._data[: self.size]
@@ -104,6 +106,13 @@ class Replay:
                 raise DataError(f"Episode {self.episodes} holds NaN or infinite values in its {name}.")
         if not self._pixels:
             self._pixels = tuple(_Rows() for _ in episode.pixels)
+        # All shapes before the first row is written: a refused episode must leave nothing behind.
+        for rows, new in zip(
+            (self._low_dim, self._action, self._reward, *self._pixels),
+            (low_dim, episode.action, episode.reward, *episode.pixels),
+            strict=True,
+        ):
+            rows.check(new)
         self._start.append(self._action.size)
         # A row of its own for the last observation keeps one index for all arrays.
         self._action.append(np.concatenate([episode.action, np.zeros_like(episode.action[:1])]))
