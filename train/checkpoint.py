@@ -71,7 +71,9 @@ def save(
     agent.postprocessor.save_pretrained(model)
     (model / "train_config.json").write_text(json.dumps(run_config, indent=2))
     torch.save(learner.state_dict(), state / "optimizer.pt")
-    torch.save(torch.get_rng_state(), state / "torch_rng.pt")
+    # Exploration draws on the policy's device, everything else on the CPU.
+    devices = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
+    torch.save([torch.get_rng_state(), *devices], state / "torch_rng.pt")
     replay.save(state / "online_episodes.npz", first_online)
     progress = {"counters": asdict(counters), "tables": tables, "numpy_rng": rng.bit_generator.state}
     (state / "progress.json").write_text(json.dumps(progress))
@@ -98,7 +100,10 @@ def restore(
     replay.load(state / "online_episodes.npz")
     progress = json.loads((state / "progress.json").read_text())
     rng.bit_generator.state = progress["numpy_rng"]
-    torch.set_rng_state(torch.load(state / "torch_rng.pt", weights_only=True))
+    cpu, *devices = torch.load(state / "torch_rng.pt", weights_only=True)
+    torch.set_rng_state(cpu)
+    if len(devices) == torch.cuda.device_count():  # on another machine a resumed run goes on, but not identically
+        torch.cuda.set_rng_state_all(devices)
     return Counters(**progress["counters"]), progress["tables"]
 
 
