@@ -1,6 +1,7 @@
 """The coarse-to-fine critic: action selection (Algorithm 1) and the loss (Algorithm 2) over all levels."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
@@ -60,6 +61,14 @@ class CQNModel(nn.Module):
         if s.brightness or s.contrast:
             views = tuple(colour_jitter(_unit(v), s.brightness, s.contrast, generator) for v in views)
         return Observation(views, observation.low_dim)
+
+    def augment_batch(self, batch: Batch) -> Batch:
+        """The batch with both observations augmented, each on its own."""
+        return replace(
+            batch,
+            observation=self.augment(batch.observation),
+            next_observation=self.augment(batch.next_observation),
+        )
 
     def encode(self, observation: Observation) -> Features:
         """Pixel features [B, E] (None without cameras) and low-dim values [B, S*P] (None without state)."""

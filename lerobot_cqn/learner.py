@@ -30,15 +30,7 @@ class Learner:
         Raises NonFiniteLossError before the weights are touched.
         """
         batch = batch.to(self.model.support.device)
-        augmented = Batch(
-            self.model.augment(batch.observation),
-            batch.action,
-            batch.reward,
-            batch.discount,
-            self.model.augment(batch.next_observation),
-            batch.demo,
-        )
-        loss, stats = self.model.loss(augmented)
+        loss, stats = self.model.loss(self.model.augment_batch(batch))
         if not torch.isfinite(loss):
             raise NonFiniteLossError(
                 f"The loss is {loss.item()}: expected a finite number. Look for NaN or huge values in the states and "

@@ -122,14 +122,7 @@ class CQNPolicy(PreTrainedPolicy):
         """Loss of Algorithm 2 on a batch of LeRobot's data loader; every sample counts as a demonstration."""
         data = self.to_batch(batch)
         if self.training:
-            data = Batch(
-                self.model.augment(data.observation),
-                data.action,
-                data.reward,
-                data.discount,
-                self.model.augment(data.next_observation),
-                data.demo,
-            )
+            data = self.model.augment_batch(data)
         loss, stats = self.model.loss(data)
         return loss, {name: value.item() for name, value in stats.items() if name != "loss"}
 

@@ -42,7 +42,7 @@ class ViewEncoder(nn.Module):
         for convolution, norm in zip(self.convolutions, self.norms, strict=True):
             # Layer norm over the last axis of the channels-last view: no copy when memory is channels-last.
             features = norm(convolution(pixels).permute(0, 2, 3, 1))
-            pixels = F.silu(features).permute(0, 3, 1, 2)
+            pixels = F.silu(features, inplace=not features.requires_grad).permute(0, 3, 1, 2)
         return pixels.flatten(1)
 
 

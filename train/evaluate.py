@@ -12,8 +12,9 @@ from .interfaces import Environment
 
 __all__ = ["EVAL_SEED", "Evaluation", "evaluate", "wilson_interval"]
 
-# Far from the seeds of training episodes, the same for every run: variants are compared on equal episodes.
-EVAL_SEED = 1_000_000
+# Far from the seeds of training episodes (seed * 100,000 + episode), and the same for every run: variants are compared
+# on equal episodes.
+EVAL_SEED = 2_147_000_000
 
 
 @dataclass(frozen=True)
