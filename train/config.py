@@ -63,7 +63,7 @@ class RunConfig:
     output_dir: Path | None = None  # a new or empty folder for checkpoints and metrics
     resume: bool = False  # continue the run in output_dir from its last checkpoint
     seed: int = 1000  # of weights, batches, exploration and training scenes
-    steps: int = 30_000  # control steps online; 0 trains offline only
+    steps: int = 30_000  # control steps online, then the episode is finished; 0 trains offline only
     offline_updates: int = 0  # updates on the demonstrations before the first step
     updates_per_step: int | None = None  # after each control step; None: the preset's
     updates_per_episode: int | None = None  # between episodes; None: the preset's

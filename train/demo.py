@@ -25,6 +25,7 @@ from lerobot_cqn.errors import CQNError
 
 __all__ = ["DemoConfig", "main", "run_demo"]
 
+LOG_EVERY_S = 30.0  # between lines where there is no terminal for a bar
 VARIANTS = {"filtered": "pauses dropped", "unfiltered": "pauses kept"}
 ENV = ("--env.type=ur5e_station", "--env.task=click_button")
 
@@ -156,11 +157,16 @@ def train(stages: Stages, data: dict[str, Path]) -> None:
         tasks: dict[str, TaskID] = {
             name: bars.add_task(f"training, {VARIANTS[name]}", total=total, note="") for name in running
         }
+        told = time.monotonic()
         try:
             while any(process.poll() is None for process in running.values()):
                 for name, task in tasks.items():
                     done, note = _progress(config.output_dir / name, config)
                     bars.update(task, completed=done, note=note)
+                    if not stages.console.is_terminal and time.monotonic() - told > LOG_EVERY_S:
+                        stages.console.print(f"  training, {VARIANTS[name]:<16} {done}/{total}  {note}")
+                if time.monotonic() - told > LOG_EVERY_S:
+                    told = time.monotonic()
                 time.sleep(1.0)
         except KeyboardInterrupt:
             for process in running.values():  # they have received the signal too, and are saving
@@ -234,7 +240,7 @@ def main() -> int:
             console.print(f"Already done; delete {config.output_dir} to run it again.")
             summary = json.loads(finished.read_text())
         else:
-            console.print("CQN on paused demonstrations, with and without the pause filter (about 7 minutes)")
+            console.print("CQN on paused demonstrations, with and without the pause filter: 6-9 minutes")
             summary = run_demo(config, console)
         show(summary, config, console)
     except KeyboardInterrupt:

@@ -36,10 +36,10 @@ def load_metadata(settings: DatasetSettings) -> LeRobotDatasetMetadata:
     try:
         meta = LeRobotDatasetMetadata(settings.repo_id, root=settings.root)
     except Exception as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
         raise DataError(
-            f"Cannot read the dataset '{settings.repo_id}' at {root}: {reason} Expected a LeRobotDataset v3: check "
-            "--dataset.repo_id, and --dataset.root when it is local."
+            f"No readable LeRobotDataset v3 '{settings.repo_id}' at {root}: give --dataset.root=DIR for a local one, "
+            f"or check --dataset.repo_id ({reason})."
         ) from error
     if not meta.total_episodes or not meta.total_frames:
         raise DataError(f"The dataset at {root} is empty: expected at least one episode; record some first.")

@@ -82,7 +82,11 @@ class Trainer:
         self.monitor.phase("online", self.config.steps, c.env_steps)
         while c.env_steps < self.config.steps:
             before = c.env_steps
-            self.episode()
+            try:
+                self.episode()
+            except Interrupted:  # the unfinished episode is dropped, so its steps do not count either
+                c.env_steps = before
+                raise
             for _ in range(self.config.schedule["updates_per_episode"]):
                 self.update()
             if freq and c.env_steps // freq > before // freq and c.env_steps < self.config.steps:

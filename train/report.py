@@ -6,6 +6,7 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +44,8 @@ def write_report(config: "DemoConfig", labels: Mapping[str, str], wall_s: float)
     steps = {"filtered": dropped["total"]["kept"], "unfiltered": dropped["total"]["steps"]}
     summary: dict[str, Any] = {
         "task": "ur5e_station / click_button, state observations",
-        "config": {name: str(value) for name, value in vars(config).items()},
+        "config": vars(config) | {"output_dir": str(config.output_dir)},
+        "versions": {name: version(name) for name in ("lerobot", "torch", "mujoco", "lerobot_policy_cqn")},
         "wall_s": round(wall_s, 1),
         "expert": expert,
         "variants": {
@@ -175,8 +177,11 @@ h1 { font-size: 1.7rem; margin-bottom: .2rem; } h2 { font-size: 1.2rem; margin-t
 table { border-collapse: collapse; margin: 1rem 0; } th, td { padding: .35rem .9rem; border-bottom: 1px solid #ddd; }
 td:not(:first-child), th:not(:first-child) { text-align: right; font-variant-numeric: tabular-nums; }
 th { text-align: left; font-weight: 600; } img { max-width: 100%; }
-.films { display: grid; grid-template-columns: repeat(auto-fit, minmax(13rem, 1fr)); gap: 1rem; }
-figure { margin: 0; } figcaption { font-size: .9rem; color: #444; } pre { background: #f5f5f5; padding: .8rem;
+.scroll { overflow-x: auto; }
+@media (max-width: 40rem) { th, td { padding: .35rem .4rem; } td .note { display: block; } }
+.films { display: grid; grid-template-columns: repeat(auto-fit, minmax(11rem, 1fr)); gap: 1rem; }
+figure { margin: 0; }
+.strip { margin-bottom: 1rem; } figcaption { font-size: .9rem; color: #444; } pre { background: #f5f5f5; padding: .8rem;
 overflow-x: auto; font-size: .85rem; }
 """
 
@@ -202,8 +207,8 @@ def _page(
         for name, frames in films.items()
     )
     strips = "".join(
-        f"<figure>{_image(figures.film_strip(frames), 'png', name)}"
-        f"<figcaption>{html.escape(name)}</figcaption></figure>"
+        f"<figure class='strip'><figcaption>{html.escape(name)}</figcaption>"
+        f"{_image(figures.film_strip(frames), 'png', name)}</figure>"
         for name, frames in films.items()
     )
     return f"""<!doctype html><html lang="en"><head><meta charset="utf-8">
@@ -212,22 +217,26 @@ def _page(
 <p class="lead">{config["demonstrations"]} scripted demonstrations of pressing a button, {total["share"]:.0%} of their
 time steps pauses. With the pauses dropped, CQN succeeds in <b>{best["success_rate"]:.0%}</b> of {best["n"]} evaluation
 episodes; with the pauses left in, in <b>{worst["success_rate"]:.0%}</b>. Same seeds, same settings, one run each.</p>
-<table><tr><th>demonstrations</th><th>steps</th><th>after offline</th><th>after online</th></tr>{body}</table>
+<div class="scroll"><table>
+<tr><th>demonstrations</th><th>steps</th><th>after offline</th><th>after online</th></tr>{body}</table></div>
 <p class="note">Success over evaluation episodes of the deterministic policy, 95 % Wilson interval in brackets. The
 scripted expert is evaluated on the same seeds. One training run per variant: the interval is that of the evaluation,
 not of training.</p>
 <h2>Learning</h2>{_image(pictures["curves"], "png", "success rate over environment steps")}
 <p class="note">{config["offline_updates"]} offline updates, then {config["steps"]} control steps online with one update
-each; {summary["wall_s"] / 60:.1f} minutes for everything.</p>
+each; {summary["wall_s"] / 60:.1f} minutes for recording, filtering and both
+trainings.</p>
 <h2>What the filter dropped</h2>{_image(pictures["dropped"], "png", "dropped time steps per demonstration")}
 <p class="note">{total["steps"]} time steps recorded, {total["kept"]} kept. A step is a pause when no joint moved by
 more than the threshold since the last kept step; gripper changes and the last step are always kept.</p>
 <h2>What it looks like</h2><p class="note">One scene, the first in which each final policy does what it does in most
 of its first six evaluation episodes.</p><div class="films">{film_html}</div>
 <h2>The same, frame by frame</h2>{strips}
-<h2>Do it again</h2><pre>make demo
+<h2>Do it again</h2><pre>rm -r {html.escape(config["output_dir"])} &amp;&amp; make demo
+source .venv/bin/activate
 lerobot-eval --policy.path={html.escape(config["output_dir"])}/filtered/checkpoints/last/pretrained_model \\
-  --env.type=ur5e_station --env.task=click_button --eval.n_episodes=50 --policy.device=cpu</pre>
+  --env.type=ur5e_station --env.task=click_button --eval.n_episodes=50 --eval.batch_size=5 \\
+  --policy.device=cpu</pre>
 </body></html>
 """
 
