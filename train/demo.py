@@ -91,14 +91,22 @@ class Stages:
             lines = log.read_text(errors="replace").strip().splitlines() or ["no output"]
             raise DemoError(f"'{name}' failed with exit code {code}: {lines[-1]} (all of it in {log})")
 
-    def run(self, name: str, text: str, done: Path, module: str, *arguments: str) -> None:
-        """Run a command unless `done` exists."""
-        begun = time.monotonic()
-        if done.exists():
+    def run(self, name: str, text: str, target: Path, module: str, *arguments: str) -> None:
+        """Run a command that makes the folder `target`, unless an earlier start has finished it."""
+        begun, finished = time.monotonic(), self.logs / f"{name}.done"
+        if finished.exists():
             self.console.print(f"  {text:<58} already done")
             return
+        _fresh(target)
         with self.console.status(f"  {text}"):
-            self.check(name, self.start(name, module, *arguments).wait())
+            process = self.start(name, module, *arguments)
+            try:
+                code = process.wait()
+            except KeyboardInterrupt:  # it has received the signal too, and is tidying up
+                process.wait()
+                raise
+            self.check(name, code)
+        finished.touch()
         self.console.print(f"  {text:<58} {time.monotonic() - begun:5.0f} s")
 
 
@@ -119,12 +127,12 @@ def _prepare_and_train(stages: Stages) -> None:
     report = config.output_dir / "dropped.json"
     stages.run(
         "record", f"recording {config.demonstrations} demonstrations, {config.pause_share:.0%} pauses",
-        data["unfiltered"] / "meta" / "info.json", "cqn_data.cli", "record", *ENV, "--repo_id=demo/unfiltered",
+        data["unfiltered"], "cqn_data.cli", "record", *ENV, "--repo_id=demo/unfiltered",
         f"--root={data['unfiltered']}", f"--episodes={config.demonstrations}", f"--pause_share={config.pause_share}",
         f"--seed={config.seed}",
     )  # fmt: skip
     stages.run(
-        "filter", "dropping the pauses", data["filtered"] / "meta" / "info.json", "cqn_data.cli", "filter",
+        "filter", "dropping the pauses", data["filtered"], "cqn_data.cli", "filter",
         "--repo_id=demo/unfiltered", f"--root={data['unfiltered']}", "--new_repo_id=demo/filtered",
         f"--new_root={data['filtered']}", f"--report={report}",
     )  # fmt: skip
@@ -181,7 +189,7 @@ def _finished(run: Path) -> bool:
 
 
 def _fresh(run: Path) -> Path:
-    """Move a run that died before its first checkpoint out of the way."""
+    """Move what a cut-off start has left out of the way."""
     if run.exists():
         run.rename(run.with_name(f"{run.name}-unfinished-{int(time.time())}"))
     return run

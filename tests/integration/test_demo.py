@@ -7,6 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from rich.console import Console
+
+from cqn_train.demo import DemoConfig, Stages
 
 TINY = (
     "--demonstrations=3", "--offline_updates=4", "--steps=30", "--eval_freq=0", "--eval_episodes=1",
@@ -45,10 +48,23 @@ def test_demo_runs_every_arrow_and_a_second_start_does_not_repeat_it(tmp_path: P
     assert stamps == {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
 
 
+def test_what_a_cut_off_recording_left_is_not_taken_for_all_of_it(tmp_path: Path) -> None:
+    """A folder without the mark of a finished stage is moved aside, not used and not deleted."""
+    left = tmp_path / "data" / "unfiltered"
+    left.mkdir(parents=True)
+    (left / "part").write_text("of a recording")
+    stages = Stages(DemoConfig(output_dir=tmp_path), Console(quiet=True))
+    stages.run("record", "recording", left, "json.tool", "--help")
+    assert not left.exists()
+    assert [(path / "part").read_text() for path in left.parent.iterdir()] == ["of a recording"]
+    assert (stages.logs / "record.done").exists()
+
+
 def test_demo_names_the_command_that_failed(tmp_path: Path) -> None:
     """A broken stage ends in one line with the log's last line, not in a traceback."""
     out = tmp_path / "demo"
-    (out / "data" / "unfiltered").mkdir(parents=True)  # in the way of the recording
+    out.mkdir()
+    (out / "data").write_text("a file in the way of the recording")
     command = [sys.executable, "-m", "cqn_train.demo", f"--output_dir={out}", *TINY]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 2
