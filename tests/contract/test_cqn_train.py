@@ -220,7 +220,7 @@ def assert_refused(arguments: list[str], said: list[str], capfd: pytest.CaptureF
     ("name", "said"),
     [
         ("missing", ["No dataset at", "missing", "expected meta/info.json", "check --dataset.root"]),
-        ("broken", ["No readable LeRobotDataset v3", "Expected a LeRobotDataset v3"]),
+        ("broken", ["No readable LeRobotDataset v3", "--dataset.root=DIR"]),
         ("empty", ["is empty", "expected at least one episode"]),
         ("no_action", ["Expected one action vector under 'action'", "found None"]),
         ("no_observation", ["Nothing to observe", "observation.state", "found []"]),
