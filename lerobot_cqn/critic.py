@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from .augmentation import colour_jitter, random_shift
 from .distributional import expectation, project, support
 from .intervals import decode, encode, previous_centres, zoom
-from .losses import demo_mean, dominance_loss, margin_loss, q_learning_loss, scalar_q_learning_loss
+from .losses import demo_mean, dominance_loss, margin_loss, q_learning_loss, scalar_q_learning_loss, take_bin
 from .networks import CoarseToFineNetwork, Projected, ViewEncoder, initialise, zero_head
 from .schema import Batch, Observation
 from .settings import CQNSettings
@@ -157,7 +157,7 @@ class CQNModel(nn.Module):
             path, _ = self.greedy(self.critic, self.project(self.critic, next_features))
         else:
             path, _ = self.greedy(self.target_critic, target)
-        logits = _take(self.evaluate(self.target_critic, target, path), path)  # [B, L, D, A]
+        logits = take_bin(self.evaluate(self.target_critic, target, path), path)[..., 0, :]  # [B, L, D, A]
         if not s.distributional:
             return reward[..., None] + discount[..., None] * logits[..., 0]
         return project(F.softmax(logits, dim=-1), reward, discount, self.support)
@@ -173,7 +173,7 @@ class CQNModel(nn.Module):
         if s.rl_loss_scale > 0:
             with torch.no_grad():
                 target = self.td_target(self.encode(batch.next_observation), batch.reward, batch.discount)
-            taken = _take(logits, indices)
+            taken = take_bin(logits, indices)[..., 0, :]
             if s.distributional:
                 rl = q_learning_loss(taken, target).mean()
             else:
@@ -209,8 +209,3 @@ def _centred(pixels: Tensor, layout: torch.memory_format) -> Tensor:
     if pixels.dtype == torch.uint8:  # the layout changes while values are small, the rest is in place
         return pixels.to(torch.float32, memory_format=layout).div_(255).sub_(0.5)
     return (pixels - 0.5).contiguous(memory_format=layout)
-
-
-def _take(values: Tensor, index: Tensor) -> Tensor:
-    """Entries of the chosen bins: [B, L, D, N, A], [B, L, D] -> [B, L, D, A]."""
-    return values.gather(-2, index[..., None, None].expand(*index.shape, 1, values.shape[-1]))[..., 0, :]

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-__all__ = ["demo_mean", "dominance_loss", "margin_loss", "q_learning_loss", "scalar_q_learning_loss"]
+__all__ = ["demo_mean", "dominance_loss", "margin_loss", "q_learning_loss", "scalar_q_learning_loss", "take_bin"]
 
 
 def q_learning_loss(logits_taken: Tensor, target: Tensor) -> Tensor:
@@ -44,7 +44,7 @@ class _Dominance(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, probs: Tensor, expert: Tensor) -> Tensor:
         cdf = probs.cumsum(-1)
-        gap = cdf.neg_().sub_(_take_bin(cdf, expert))  # cdf is negated by now: CDF(expert) - CDF
+        gap = cdf.neg_().sub_(take_bin(cdf, expert))  # cdf is negated by now: CDF(expert) - CDF
         ctx.save_for_backward(gap >= 0, expert)  # equality counts, as for torch.clamp: a new critic is all ties
         return gap.clamp_(min=0).sum(-1).mean((1, 2, 3))
 
@@ -79,8 +79,8 @@ def demo_mean(per_sample: Tensor, demo: Tensor) -> Tensor:
     return (per_sample * flags).sum() / flags.sum().clamp(min=1)
 
 
-def _take_bin(values: Tensor, index: Tensor) -> Tensor:
-    """[B, L, D, N, A], [B, L, D] -> [B, L, D, 1, A]."""
+def take_bin(values: Tensor, index: Tensor) -> Tensor:
+    """Entries of the chosen bins: [B, L, D, N, A], int64 [B, L, D] -> [B, L, D, 1, A]."""
     return values.gather(-2, _bin_index(index, values.shape[-1]))
 
 
