@@ -133,7 +133,9 @@ def test_killed_and_resumed_equals_uninterrupted(straight: Path, click: list[str
 def test_ctrl_c_saves_and_says_how_to_continue(click: list[str], tmp_path: Path) -> None:
     run = tmp_path / "run"
     process = start(*TINY_RUN, *click, "--steps=1000000", f"--output_dir={run}")
-    wait_for(lambda: (run / "episodes.csv").exists() and len(tables(run)["episodes"]) >= 2, process)
+    wait_for(
+        lambda: (run / "evaluations.csv").exists() and len(tables(run)["episodes"]) >= 2, process
+    )  # the last table to be made
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130
