@@ -1,6 +1,7 @@
 """Entry point of ``cqn-data``: finds the operation, turns errors into one line and an exit code.
 
-Exit codes: 0 done, 1 unexpected failure, 2 a mistake that can be mended by the caller, 130 interrupted.
+Exit codes: 0 done, 1 unexpected failure or errors that inspect --strict found, 2 a mistake that can be mended by the
+caller, 130 interrupted.
 Nothing heavy is imported here, so that ``--help`` answers at once.
 """
 
@@ -15,10 +16,21 @@ from .console import Interrupted, note, quiet, result
 
 __all__ = ["OPERATIONS", "main"]
 
-# Operation -> one line for --help. Each lives in the module of its name and offers help() and main(args).
+# Operation -> one line for --help. Each lives in the module of its name and offers help() and main(args); an int that
+# main returns is the exit code.
 OPERATIONS = {
+    "convert": "turn RLBench, robomimic, ALOHA, diffusion_policy, NPZ or LeRobot v2.1 data into a LeRobotDataset v3",
+    "inspect": "look at a dataset before training: pauses, cameras, outliers, what is missing",
     "record": "record scripted demonstrations in an environment, as teleoperation would",
-    "filter": "drop the time steps in which nothing moves",
+    "filter": "leave out the time steps in which nothing moves",
+    "trim": "cut heads and tails of episodes",
+    "delta": "turn absolute joint actions into delta joint actions, or back",
+    "resample": "take fewer steps a second",
+    "resize": "scale the pictures, and cut them out first where asked",
+    "label": "write sparse rewards: 1 on the last step of successful episodes",
+    "bounds": "set the action bounds that training scales by",
+    "drop": "leave out whole episodes, by number or by rule",
+    "run": "run several of these as one pass over the videos, from a recipe",
 }
 
 
@@ -62,8 +74,8 @@ def _run(name: str, args: list[str]) -> int:
     if "-h" in args or "--help" in args:
         result(module.help())
         return 0
-    module.main(args)
-    return 0
+    code = module.main(args)
+    return code if isinstance(code, int) else 0
 
 
 def _explain(name: str, error: Exception) -> int:

@@ -64,8 +64,8 @@ def progress() -> Progress:
     )
 
 
-def table(columns: Sequence[str], rows: Sequence[Iterable[str]], total: Iterable[str]) -> None:
-    """Print right-aligned ``rows`` and a ``total`` row; beyond 40 rows only the first 40 are shown."""
+def table(columns: Sequence[str], rows: Sequence[Iterable[str]], total: Iterable[str] = ()) -> None:
+    """Print right-aligned ``rows`` and a ``total`` row, if there is one; beyond 40 rows only 40 are shown."""
     view = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
     for name in columns:
         view.add_column(name, justify="right", no_wrap=True)
@@ -73,8 +73,9 @@ def table(columns: Sequence[str], rows: Sequence[Iterable[str]], total: Iterable
         view.add_row(*row)
     if len(rows) > MAX_ROWS:
         view.add_row(*["…"] * len(columns))
-    view.add_section()
-    view.add_row(*total, style="bold")
+    if total := tuple(total):
+        view.add_section()
+        view.add_row(*total, style="bold")
     Console().print(view)
     if len(rows) > MAX_ROWS:
-        note(f"{len(rows) - MAX_ROWS} more episodes are in the report (--report=FILE).")
+        note(f"{len(rows) - MAX_ROWS} more rows are in the report (--report=FILE).")

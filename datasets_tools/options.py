@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any
 
-__all__ = ["help_page", "option", "parse"]
+__all__ = ["help_page", "option", "parse", "parse_all"]
 
 
 def option(default: Any = dataclasses.MISSING, *, help: str) -> Any:
@@ -16,48 +16,65 @@ def option(default: Any = dataclasses.MISSING, *, help: str) -> Any:
 
 
 def parse[Config](config_class: type[Config], args: Sequence[str]) -> Config:
-    """Read flags into ``config_class``.
+    """Read flags into one dataclass; errors as in :func:`parse_all`."""
+    config: Config = parse_all((config_class,), args)[0]
+    return config
+
+
+def parse_all(config_classes: Sequence[type], args: Sequence[str]) -> tuple[Any, ...]:
+    """Read flags into dataclasses that share one command line.
 
     Args:
-        config_class: a dataclass whose fields are made by :func:`option`.
+        config_classes: dataclasses whose fields are made by :func:`option`; no name occurs twice.
         args: e.g. ``["--threshold=0.01", "--dry_run"]``; a flag without a value means true for booleans.
+
+    Returns:
+        one instance of each class.
 
     Raises:
         ConfigError: unknown flag (with the nearest one), missing required flag, or a value of another type.
     """
-    import draccus
-    from draccus.utils import DecodingError, ParsingError
+    from lerobot_cqn.errors import ConfigError, one_of
 
-    from lerobot_cqn.errors import ConfigError, CQNError, one_of
-
-    fields = {f.name: f for f in dataclasses.fields(config_class)}  # type: ignore[arg-type]
+    owners = {f.name: (c, f) for c in config_classes for f in dataclasses.fields(c)}
     given: list[str] = []
-    expanded: list[str] = []
+    flags: dict[type, list[str]] = {c: [] for c in config_classes}
+    latest: type | None = None  # class of a flag whose value is the next argument
     for position, arg in enumerate(args):
         name, equals, _ = arg.partition("=")
         if not name.startswith("--"):
-            if position == 0 or not args[position - 1].startswith("--") or "=" in args[position - 1]:
+            if latest is None:
                 raise ConfigError(f"Unexpected '{arg}': options are written --name=value.")
-            expanded.append(arg)
+            flags[latest].append(arg)
+            latest = None
             continue
         name = name[2:].partition(".")[0]
-        if name not in fields and name != "config_path":
-            raise ConfigError(one_of("option", f"--{name}", [f"--{f}" for f in fields]))
+        if name not in owners:
+            raise ConfigError(one_of("option", f"--{name}", [f"--{f}" for f in owners]))
+        owner, field = owners[name]
         following = args[position + 1] if position + 1 < len(args) else "--"
-        if not equals and following.startswith("--"):
-            if name not in fields or fields[name].type is not bool:
-                raise ConfigError(f"Option --{name} needs a value: --{name}=VALUE.")
-            expanded.append(f"--{name}=true")
-        else:
-            expanded.append(arg)
+        bare = not equals and following.startswith("--")
+        if bare and field.type not in (bool, "bool"):
+            raise ConfigError(f"Option --{name} needs a value: --{name}=VALUE.")
+        flags[owner].append(f"--{name}=true" if bare else arg)
+        latest = None if equals or bare else owner
         given.append(name)
-    missing = [n for n, f in fields.items() if _required(f) and n not in given and "config_path" not in given]
+    missing = [n for n, (_, f) in owners.items() if _required(f) and n not in given]
     if missing:
         raise ConfigError(f"Missing {', '.join(f'--{n}=…' for n in missing)}; --help shows an example.")
+    return tuple(_decode(c, flags[c]) for c in config_classes)
+
+
+def _decode(config_class: type, flags: list[str]) -> Any:
+    import draccus
+    from draccus.utils import DecodingError, ParsingError
+
+    from lerobot_cqn.errors import ConfigError, CQNError
+
     captured = io.StringIO()
     try:
         with contextlib.redirect_stderr(captured):
-            config: Config = draccus.parse(config_class, args=expanded)
+            return draccus.parse(config_class, args=flags)
     except DecodingError as error:
         raise ConfigError(f"Bad option value: {' '.join(str(error).split())}") from error
     except ParsingError as error:
@@ -68,14 +85,13 @@ def parse[Config](config_class: type[Config], args: Sequence[str]) -> Config:
     except SystemExit as error:
         lines = captured.getvalue().strip().splitlines() or ["unreadable options"]
         raise ConfigError(lines[-1].removeprefix("-: error: ")) from error
-    return config
 
 
-def help_page(name: str, summary: str, config_class: type, example: str, extra: str = "") -> str:
+def help_page(name: str, summary: str, config: type | tuple[type, ...], example: str, extra: str = "") -> str:
     """Help text of an operation: what it does, an example that can be pasted, every flag with its default."""
     lines = [f"cqn-data {name}: {summary}", "", "Example:", textwrap.indent(example.strip("\n"), "  "), ""]
     lines.append("Options:")
-    for field in dataclasses.fields(config_class):
+    for field in (f for c in (config if isinstance(config, tuple) else (config,)) for f in dataclasses.fields(c)):
         text = field.metadata.get("help", "")
         default = _default(field)
         suffix = "(required)" if _required(field) else "" if default in (None, "") else f"(default {default})"

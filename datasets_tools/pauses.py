@@ -57,7 +57,14 @@ class Rule:
 
 @dataclass(frozen=True)
 class EpisodeReport:
-    """What happened to one episode; ``runs`` are (first step, length) of the dropped pauses."""
+    """What happened to one episode.
+
+    Attributes:
+        runs: (first step, length) of the dropped pauses.
+        gripper_events: steps at which the gripper changed.
+        dropped_near_gripper: dropped steps at most 3 steps from one.
+        dropped_while_commanded: dropped steps whose command moved by a threshold while the arm did not.
+    """
 
     episode: int
     steps: int
@@ -65,6 +72,7 @@ class EpisodeReport:
     runs: tuple[tuple[int, int], ...]
     gripper_events: int
     dropped_near_gripper: int
+    dropped_while_commanded: int = 0
 
     @property
     def dropped(self) -> int:
@@ -87,6 +95,7 @@ class EpisodeReport:
             "pauses": [{"start": start, "length": length} for start, length in self.runs],
             "gripper_events": self.gripper_events,
             "dropped_near_gripper": self.dropped_near_gripper,
+            "dropped_while_commanded": self.dropped_while_commanded,
         }
 
 
@@ -128,8 +137,24 @@ def pause_runs(keep: Mask) -> tuple[tuple[int, int], ...]:
     return tuple((int(a), int(b - a)) for a, b in zip(edges[::2], edges[1::2], strict=True))
 
 
-def report_episode(episode: int, state: NDArray[Any], action: NDArray[Any], keep: Mask, rule: Rule) -> EpisodeReport:
-    """Describe a mask; "near" a gripper event means at most 3 steps from it."""
+def report_episode(
+    episode: int,
+    state: NDArray[Any],
+    action: NDArray[Any],
+    keep: Mask,
+    rule: Rule,
+    commanded: NDArray[Any] | None = None,
+) -> EpisodeReport:
+    """Describe a mask.
+
+    Args:
+        episode: number of the episode.
+        state: (T, S) as for :func:`keep_mask`.
+        action: (T, A) as for :func:`keep_mask`.
+        keep: (T,) from :func:`keep_mask`.
+        rule: the rule it came from.
+        commanded: (T, J) commanded joint positions, where the data has them.
+    """
     events = _moves(state, action, rule, keep)[1]
     near = np.zeros_like(keep)
     for step in np.flatnonzero(events):
@@ -141,7 +166,14 @@ def report_episode(episode: int, state: NDArray[Any], action: NDArray[Any], keep
         runs=pause_runs(keep),
         gripper_events=int(events.sum()),
         dropped_near_gripper=int((near & ~keep).sum()),
+        dropped_while_commanded=0 if commanded is None else _pushing(commanded, keep, rule),
     )
+
+
+def _pushing(commanded: NDArray[Any], keep: Mask, rule: Rule) -> int:
+    """Dropped steps at which a joint's command moved by the smallest threshold or more."""
+    changes = np.abs(np.diff(np.asarray(commanded, np.float64), axis=0, prepend=commanded[:1])).max(axis=1, initial=0)
+    return int((~keep & (changes >= min(rule.thresholds, default=np.inf))).sum())
 
 
 def _moves(state: NDArray[Any], action: NDArray[Any], rule: Rule, forced: Mask) -> tuple[Mask, Mask]:

@@ -4,6 +4,7 @@ No reward column, and the pauses of a person who thinks are in: what comes after
 """
 
 import contextlib
+import inspect
 import signal
 import threading
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from .options import help_page, option, parse
 __all__ = ["RecordConfig", "ScriptedTeleoperator", "help", "main", "record_dataset"]
 
 FAILURES_IN_A_ROW = 20
+IS_PAUSE = "complementary_info.is_pause"
 EXAMPLE = """
 cqn-data record --env.type=ur5e_station --env.task=click_button \\
     --repo_id=local/click --root=data/click --episodes=30 --pause_share=0.45
@@ -23,6 +25,7 @@ cqn-data record --env.type=ur5e_station --env.task=click_button \\
 NOTES = """
   --env.type=NAME (required), --env.task=…, --env.obs_type=… and the other settings of LeRobot's environment NAME.
   --env.discover_packages_path=PACKAGE imports a package that registers further environments.
+Where the teleoperator says when it pauses, complementary_info.is_pause has it for each step, to check filters against.
 Ctrl-C ends the recording; the episodes so far are kept as a complete dataset.
 """
 
@@ -36,6 +39,9 @@ class RecordConfig:
     episodes: int = option(30, help="Successful demonstrations to record.")
     seed: int = option(0, help="Seed of the first attempt; each further attempt takes the next one.")
     pause_share: float = option(0.45, help="Share of time steps in which the teleoperator pauses, 0 to below 1.")
+    tremor_rad: float = option(
+        0.0, help="Standard deviation of a trembling hand's noise on each joint action, rad a step; in pauses too."
+    )
     max_steps: int | None = option(
         None, help="An attempt that takes longer has failed; by default the environment's limit."
     )
@@ -48,6 +54,8 @@ class RecordConfig:
             raise ConfigError(f"Expected --episodes >= 1, got {self.episodes}.")
         if not 0 <= self.pause_share < 1:
             raise ConfigError(f"Expected --pause_share in [0, 1), got {self.pause_share}.")
+        if not 0 <= self.tremor_rad < float("inf"):
+            raise ConfigError(f"Expected a finite --tremor_rad >= 0, got {self.tremor_rad}.")
         if self.max_steps is not None and self.max_steps < 1:
             raise ConfigError(f"Expected --max_steps >= 1, got {self.max_steps}.")
         if self.seed < 0:
@@ -55,7 +63,11 @@ class RecordConfig:
 
 
 class ScriptedTeleoperator(Protocol):
-    """What an environment's ``scripted_teleoperator(pause_share=, seed=)`` returns."""
+    """What an environment's ``scripted_teleoperator(pause_share=, seed=)`` returns.
+
+    With ``--tremor_rad`` it is called with ``tremor_rad=`` too. A teleoperator may have an attribute ``pausing``, bool:
+    whether the last ``act`` was a pause.
+    """
 
     def reset(self, seed: int) -> None:
         """Begin a demonstration; called after the environment's reset."""
@@ -92,7 +104,7 @@ def record_dataset(config: RecordConfig, env_config: Any) -> None:
     """
     config.validate()
     from .source import local_root
-    from .target import new_dataset, refuse_existing
+    from .target import new_dataset, refuse_existing, write_history
 
     root = local_root(config.repo_id, config.root)
     refuse_existing(root)
@@ -107,6 +119,7 @@ def record_dataset(config: RecordConfig, env_config: Any) -> None:
             session.run(target)
             if target.episodes == 0:
                 session.explain(saved=0, root=str(root))
+            write_history(target.folder, [session.entry()])
             episodes, frames = target.episodes, target.frames
     session.explain(saved=episodes, root=str(root))
     retried = f" {session.failures} failed attempts were left out." if session.failures else ""
@@ -139,6 +152,8 @@ class _Session:
                 features[key] = {"dtype": "float32", "shape": value.shape, "names": _list(names.get(key))}
         shape = tuple(self.env.action_space.shape)
         features["action"] = {"dtype": "float32", "shape": shape, "names": _list(getattr(plain, "action_names", None))}
+        if self._pausing():
+            features[IS_PAUSE] = {"dtype": "bool", "shape": (1,), "names": None}
         return features
 
     def run(self, target: Any) -> None:
@@ -194,13 +209,31 @@ class _Session:
         steps, over, success = 0, False, False
         while not over and not self.stopped():
             action = np.asarray(self.teleoperator.act(), dtype=np.float32)
-            target.add({**_columns(observation), "action": action}, self.task)
+            target.add({**_columns(observation), "action": action, **self._pausing()}, self.task)
             observation, _, terminated, truncated, info = self.env.step(action)
             steps += 1
             success = bool(info.get("is_success", False))
             late = self.config.max_steps is not None and steps >= self.config.max_steps
             over = bool(terminated or truncated or success or late)
         return success
+
+    def entry(self) -> dict[str, Any]:
+        """What the history keeps: settings, and what the actions are where the environment says it."""
+        settings = {k: v for k, v in vars(self.config).items() if k not in ("repo_id", "root") and v is not None}
+        entry = {"operation": "record", "target": self.config.repo_id, "settings": settings}
+        plain = self.env.unwrapped
+        kind = getattr(plain, "action_kind", None)
+        if kind is None:
+            return entry
+        joints = [n for n in plain.action_names if n in plain.state_names and "gripper" not in n]
+        return {**entry, "deltas": {"kind": kind, "action": joints, "state": joints}}
+
+    def _pausing(self) -> dict[str, Any]:
+        """Column of one step, (1,) bool; none where the teleoperator does not say."""
+        import numpy as np
+
+        pausing = getattr(self.teleoperator, "pausing", None)
+        return {} if pausing is None else {IS_PAUSE: np.array([bool(pausing)])}
 
 
 def _columns(observation: dict[str, Any]) -> dict[str, Any]:
@@ -286,7 +319,10 @@ def _teleoperator(env: Any, env_config: Any, config: RecordConfig) -> ScriptedTe
             f"Environment '{env_config.type}' has no scripted teleoperator: record with lerobot-record, or choose one"
             " that offers scripted_teleoperator()."
         )
-    teleoperator: ScriptedTeleoperator = make(pause_share=config.pause_share, seed=config.seed)
+    tremor = {"tremor_rad": config.tremor_rad} if config.tremor_rad > 0 else {}
+    if tremor and "tremor_rad" not in inspect.signature(make).parameters:
+        raise ConfigError(f"The teleoperator of '{env_config.type}' cannot tremble; leave --tremor_rad out.")
+    teleoperator: ScriptedTeleoperator = make(pause_share=config.pause_share, seed=config.seed, **tremor)
     return teleoperator
 
 

@@ -30,7 +30,8 @@ def carries_reward(columns: Mapping[str, Any], steps: int) -> NDArray[np.bool_]:
     return marked
 
 
-def last_step_rewards(steps: int) -> dict[str, NDArray[Any]]:
-    """Reward 1, done and success on the last of ``steps`` steps, 0 and False before; each (T, 1)."""
+def last_step_rewards(steps: int, *, success: bool = True) -> dict[str, NDArray[Any]]:
+    """Done on the last of ``steps`` steps, with reward 1 and success if it was one; 0 and False elsewhere; (T, 1)."""
     last = np.arange(steps)[:, None] == steps - 1
-    return {NEXT_REWARD: last.astype(np.float32), NEXT_DONE: last, NEXT_SUCCESS: last.copy()}
+    won = last & success
+    return {NEXT_REWARD: won.astype(np.float32), NEXT_DONE: last, NEXT_SUCCESS: won}

@@ -1,19 +1,34 @@
 """Write a new LeRobotDataset v3 in one piece: it is complete under its name, or there is nothing."""
 
 import contextlib
+import ctypes
 import json
 import os
+import queue
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.video_utils import StreamingVideoEncoder
 
-from lerobot_cqn.errors import ConfigError, OutputExistsError
+from lerobot_cqn.errors import ConfigError, DataError, OutputExistsError
 
-__all__ = ["HISTORY", "Target", "append_history", "new_dataset", "refuse_existing", "refuse_inside"]
+from .console import note
+
+__all__ = [
+    "HISTORY",
+    "Target",
+    "append_history",
+    "new_dataset",
+    "new_folder",
+    "read_history",
+    "refuse_existing",
+    "refuse_inside",
+    "write_history",
+]
 
 HISTORY = Path("meta") / "cqn_history.json"
 
@@ -45,6 +60,7 @@ class Target:
         """Close the episode: statistics, video, parquet."""
         # One encoder after the other: a process for each camera would outlive an interrupt.
         self.dataset.save_episode(parallel_encoding=False)
+        _give_back_memory()
 
     def drop_episode(self) -> None:
         """Forget the steps added since the last saved episode."""
@@ -61,6 +77,52 @@ class Target:
         return int(self.dataset.meta.total_frames)
 
 
+class _PatientEncoder(StreamingVideoEncoder):
+    """Encodes while frames come in, and waits for the encoder where LeRobot's own would drop a frame."""
+
+    def feed_frame(self, video_key: str, image: Any) -> None:
+        thread, frames = self._threads[video_key], self._frame_queues[video_key]
+        while thread.is_alive():
+            try:
+                frames.put(image, timeout=1)
+            except queue.Full:
+                continue
+            return
+        raise RuntimeError(f"The encoder of '{video_key}' stopped; is the disk full?")
+
+
+class _Dataset(LeRobotDataset):
+    """LeRobot's dataset with an encoder that loses nothing."""
+
+    @staticmethod
+    def _build_streaming_encoder(
+        fps: int, rgb_encoder: Any, depth_encoder: Any, encoder_queue_maxsize: int, encoder_threads: int | None
+    ) -> StreamingVideoEncoder:
+        return _PatientEncoder(fps, rgb_encoder, depth_encoder, encoder_queue_maxsize, encoder_threads)
+
+
+@contextlib.contextmanager
+def new_folder(root: Path) -> Iterator[Path]:
+    """A temporary folder beside ``root`` that takes this name when the block ends well.
+
+    Any exception, Ctrl-C included, removes it; what a killed process left is removed by the next one for the same
+    place. Nothing is created before the block makes the folder.
+
+    Raises:
+        OutputExistsError: something is at ``root`` already, at the start or by the end.
+    """
+    refuse_existing(root)
+    root.parent.mkdir(parents=True, exist_ok=True)
+    _sweep(root)
+    folder = root.parent / f".{root.name}.{os.getpid()}.tmp"
+    try:
+        yield folder
+        refuse_existing(root)
+        os.replace(folder, root)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 @contextlib.contextmanager
 def new_dataset(
     repo_id: str,
@@ -73,47 +135,84 @@ def new_dataset(
 ) -> Iterator[Target]:
     """Create a dataset for the time of a ``with`` block and put it in place when the block ends well.
 
-    Any exception, Ctrl-C included, removes what was written; a killed process leaves only a hidden
-    ``.NAME.PID.tmp`` folder beside the place.
-
     Raises:
         OutputExistsError: something is at ``root`` already, at the start or by the end.
     """
-    refuse_existing(root)
-    root.parent.mkdir(parents=True, exist_ok=True)
-    folder = root.parent / f".{root.name}.{os.getpid()}.tmp"
     cameras = sum(f["dtype"] in ("image", "video") for f in features.values())
-    dataset: LeRobotDataset | None = None
+    with new_folder(root) as folder:
+        dataset: LeRobotDataset | None = None
+        try:
+            dataset = _Dataset.create(
+                repo_id,
+                fps=fps,
+                features={k: dict(v) for k, v in features.items()},
+                root=folder,
+                robot_type=robot_type,
+                use_videos=any(f["dtype"] == "video" for f in features.values()),
+                image_writer_threads=2 if cameras else 0,
+                rgb_encoder=encoder,
+                streaming_encoding=True,
+            )
+            yield Target(dataset, folder)
+            dataset.finalize()
+            shutil.rmtree(folder / "images", ignore_errors=True)
+        finally:
+            if dataset is not None:
+                # Finalised before the folder goes: the writer would otherwise recreate it when it is collected.
+                with contextlib.suppress(Exception):
+                    dataset.writer.cancel_pending_videos()
+                with contextlib.suppress(Exception):
+                    dataset.finalize()
+
+
+def read_history(folder: Path) -> list[dict[str, Any]]:
+    """Operations in a dataset's ``meta/cqn_history.json``, oldest first; none where there is no such file.
+
+    Raises:
+        DataError: the file is damaged.
+    """
+    path = folder / HISTORY
+    if not path.is_file():
+        return []
     try:
-        dataset = LeRobotDataset.create(
-            repo_id,
-            fps=fps,
-            features={k: dict(v) for k, v in features.items()},
-            root=folder,
-            robot_type=robot_type,
-            use_videos=any(f["dtype"] == "video" for f in features.values()),
-            image_writer_threads=2 if cameras else 0,
-            rgb_encoder=encoder,
-        )
-        yield Target(dataset, folder)
-        dataset.finalize()
-        shutil.rmtree(folder / "images", ignore_errors=True)
-        refuse_existing(root)
-        os.replace(folder, root)
-    finally:
-        if dataset is not None:
-            # Finalised before the folder goes: the writer would otherwise recreate it when it is collected.
-            with contextlib.suppress(Exception):
-                dataset.finalize()
-        shutil.rmtree(folder, ignore_errors=True)
+        operations = json.loads(path.read_text())["operations"]
+        return [dict(entry) for entry in operations]
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path} is damaged ({error!r}): mend it, or remove it to lose the history.") from error
+
+
+def write_history(folder: Path, operations: Sequence[Mapping[str, Any]]) -> None:
+    """Write ``meta/cqn_history.json``."""
+    path = folder / HISTORY
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"version": 1, "operations": list(operations)}, indent=2) + "\n")
 
 
 def append_history(folder: Path, previous: Path | None, entry: Mapping[str, Any]) -> None:
-    """Write ``meta/cqn_history.json``: the operations on ``previous`` (a dataset folder) and then ``entry``."""
-    operations: list[Any] = []
-    if previous is not None and (previous / HISTORY).is_file():
-        with contextlib.suppress(ValueError, KeyError):
-            operations = list(json.loads((previous / HISTORY).read_text())["operations"])
-    path = folder / HISTORY
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"version": 1, "operations": [*operations, dict(entry)]}, indent=2) + "\n")
+    """Write the operations on ``previous`` (a dataset folder) and then ``entry``."""
+    write_history(folder, [*(read_history(previous) if previous else []), dict(entry)])
+
+
+def _give_back_memory() -> None:
+    """Return freed memory to the system: each episode's encoder threads leave pools of it, which glibc keeps."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def _sweep(root: Path) -> None:
+    """Remove the temporary folders of processes that are no more."""
+    for left in root.parent.glob(f".{root.name}.*.tmp"):
+        number = left.name.removeprefix(f".{root.name}.").removesuffix(".tmp")
+        if number.isdigit() and not _alive(int(number)):
+            note(f"Removing {left}, which a killed process left behind.")
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _alive(number: int) -> bool:
+    try:
+        os.kill(number, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True

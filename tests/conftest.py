@@ -9,7 +9,11 @@ import shutil
 import sys
 import tempfile
 
+import hypothesis
 import pytest
+
+hypothesis.settings.register_profile("cqn", deadline=None)  # a busy machine is no failure
+hypothesis.settings.load_profile("cqn")
 
 _WORKER = "PYTEST_XDIST_WORKER" in os.environ  # a worker inherits the folder of the process that started it
 _HOME = os.environ["HF_HOME"] if _WORKER else tempfile.mkdtemp(prefix="cqn-tests-")

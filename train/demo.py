@@ -132,7 +132,7 @@ def _prepare_and_train(stages: Stages) -> None:
         f"--seed={config.seed}",
     )  # fmt: skip
     stages.run(
-        "filter", "dropping the pauses", data["filtered"], "cqn_data.cli", "filter",
+        "filter", "dropping the pauses", data["filtered"], "cqn_data.cli", "run", "simulation",
         "--repo_id=demo/unfiltered", f"--root={data['unfiltered']}", "--new_repo_id=demo/filtered",
         f"--new_root={data['filtered']}", f"--report={report}",
     )  # fmt: skip

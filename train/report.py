@@ -37,7 +37,7 @@ def write_report(config: "DemoConfig", labels: Mapping[str, str], wall_s: float)
     from .demo import read_rows
 
     out = config.output_dir
-    dropped = json.loads((out / "dropped.json").read_text())
+    dropped = json.loads((out / "dropped.json").read_text())[0]  # the first step of the recipe
     evaluations = {name: read_rows(out / name / "evaluations.csv") for name in labels}
     env_config = UR5eStationEnv()
     expert = run_expert(env_config, config.expert_episodes)

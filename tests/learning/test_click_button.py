@@ -33,7 +33,8 @@ def test_filtered_demonstrations_then_online_reach_ninety_percent(tmp_path: Path
             "--episodes=30",
             f"--seed={1000 * seed}",
         )
-        run("cqn_data.cli", "filter", "--repo_id=t/raw", f"--root={raw}", "--new_repo_id=t/kept", f"--new_root={kept}")
+        recipe = ["--repo_id=t/raw", f"--root={raw}", "--new_repo_id=t/kept", f"--new_root={kept}"]
+        run("cqn_data.cli", "run", "simulation", *recipe)
         run(
             "cqn_train.cli", "--policy.type=cqn", "--policy.preset=laptop_state", "--policy.device=cpu", *STATION,
             "--dataset.repo_id=t/kept", f"--dataset.root={kept}", f"--output_dir={out}", f"--seed={seed}",

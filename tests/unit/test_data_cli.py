@@ -25,7 +25,7 @@ def test_help_needs_no_heavy_import():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False)
     assert done.returncode == 0, done.stderr
-    for word in (*OPERATIONS, "--threshold", "(default 0.005)", "--pause_share", "Example:"):
+    for word in (*OPERATIONS, "--threshold", "(default 1)", "--pause_share", "Example:"):
         assert word in done.stdout
 
 
@@ -44,7 +44,9 @@ def test_unknown_operation_names_the_nearest(capsys):
         (["--repo_id=a/b", "--threshold"], "needs a value"),
         (["--repo_id=a/b", "--keep_last=0"], "--keep_last >= 1"),
         (["--repo_id=a/b", "--min_pause=0"], "--min_pause >= 1"),
-        (["--repo_id=a/b", "--reward=lst"], "Did you mean 'last'?"),
+        (["--repo_id=a/b", "--auto", "--threshold=1"], "only one of them"),
+        (["--repo_id=a/b", "--actions=comand"], "Did you mean 'command'?"),
+        (["--repo_id=a/b", "--preview=film.gif"], "FILE.mp4 or FILE.png"),
         (["--repo_id=a/b", "--compare=x"], "after, before"),
         (["--repo_id=a/b", '--joint_thresholds={"a": 0}'], "'a'"),
         (["--repo_id=a/b", "stray"], "Unexpected 'stray'"),

@@ -26,7 +26,12 @@ class ScriptedTeleoperator:
 
     While moving, the action depends on the present state alone. While pausing it is a zero delta with the
     gripper as it was. Pauses come at the start, at the task's natural moment, and at random.
+
+    Attributes:
+        pausing: whether the last `act` was a pause: no steering, only the tremor if there is one.
     """
+
+    pausing: bool
 
     def __init__(self, env: "UR5eStation", pause_share: float = 0.0, tremor_rad: float = 0.0, seed: int = 0) -> None:
         """Steer `env` (unwrapped).
@@ -59,6 +64,7 @@ class ScriptedTeleoperator:
         self._closure = self._env.arm.closure
         self._left = self._pause() if self._rng.random() < self._natural else 0
         self._hesitated = False
+        self.pausing = False
 
     def act(self) -> NDArray[np.float32]:
         """Action for the present state, (7,) float32 within the action space."""
@@ -70,7 +76,8 @@ class ScriptedTeleoperator:
                 self._left = self._pause() if self._rng.random() < self._natural else 0
             elif self._rng.random() < self._hazard:
                 self._left = self._pause()
-        if self._left > 0:
+        self.pausing = self._left > 0
+        if self.pausing:
             self._left -= 1
         else:
             delta = self._steer(goal.tip, goal.yaw, goal.speed)

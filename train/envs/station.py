@@ -45,7 +45,10 @@ class UR5eStation(gym.Env[Observation, NDArray[np.float32]]):
         task, task_description: name of the task, and the sentence that instructs it.
         state_names, action_names: of `agent_pos` and the action, as LeRobot names motors.
         environment_state_names: of the objects' state.
+        action_kind: what the joint deltas are differences of, as `cqn-data delta --help` names it.
     """
+
+    action_kind: ClassVar[str] = "command_steps"
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
 
