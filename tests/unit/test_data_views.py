@@ -98,7 +98,7 @@ def test_windows_of_a_lower_rate_cover_every_step_once(steps, old, data):
     assert rows[0] == 0
     assert (np.diff(rows) >= 1).all()
     assert rows[-1] < steps
-    assert len(rows) == -(-steps * new // old)
+    assert -(-steps * new // old) - len(rows) in (0, 1)
     assert (np.abs(rows / old - np.arange(len(rows)) / new) <= 0.5 / old + 1e-9).all()
 
 
