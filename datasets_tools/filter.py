@@ -161,9 +161,7 @@ Delta actions are formed anew, so that they connect the states that are left.
         """Help with the choice where it looks wrong."""
         steps, dropped = sum(r.steps for r in reports), sum(r.dropped for r in reports)
         if not self.auto and not 0.02 <= dropped / steps <= 0.8:
-            note(
-                f"{dropped / steps:.0%} of the steps go; --auto chooses a threshold, inspect shows a histogram."
-            )
+            note(f"{dropped / steps:.0%} of the steps go; --auto chooses a threshold, inspect shows a histogram.")
         pushing = sum(r.dropped_while_commanded for r in reports)
         if pushing > 0.02 * steps:
             note(

@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import errno
 import json
 import os
 import queue
@@ -14,7 +15,7 @@ from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import StreamingVideoEncoder
 
-from lerobot_cqn.errors import ConfigError, DataError, OutputExistsError
+from lerobot_cqn.errors import ConfigError, DataError, OutputError, OutputExistsError
 
 from .console import note
 
@@ -31,6 +32,7 @@ __all__ = [
 ]
 
 HISTORY = Path("meta") / "cqn_history.json"
+CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
 
 
 def refuse_existing(root: Path) -> None:
@@ -59,7 +61,10 @@ class Target:
     def save_episode(self) -> None:
         """Close the episode: statistics, video, parquet."""
         # One encoder after the other: a process for each camera would outlive an interrupt.
-        self.dataset.save_episode(parallel_encoding=False)
+        try:
+            self.dataset.save_episode(parallel_encoding=False)
+        except RuntimeError as error:  # how LeRobot passes on what happened in an encoder's thread
+            raise OutputError(f"{self.folder} could not be written: {error}") from error
         _give_back_memory()
 
     def drop_episode(self) -> None:
@@ -119,6 +124,10 @@ def new_folder(root: Path) -> Iterator[Path]:
         yield folder
         refuse_existing(root)
         os.replace(folder, root)
+    except OSError as error:
+        if error.errno not in CANNOT_WRITE:
+            raise
+        raise OutputError(f"{root} could not be written and nothing is left of it: {error}") from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 

@@ -34,12 +34,12 @@ LOW, HIGH, PER_DECADE = -10, 6, 40  # of the histogram, in log10
 BINS = (HIGH - LOW) * PER_DECADE
 BRISK = 0.95  # quantile of the motion that stands for brisk motion
 FLOOR = 1e-3  # of brisk motion; whatever is slower counts as not moving
-NO_SIGN = 1e-2  # of brisk motion, where nothing else gives a threshold
-BLUR = 0.06  # decades, standard deviation of the smoothing
+NO_SIGN = 1e-2  # of brisk motion, at most, where nothing else gives a threshold
+BLUR, BLUR_FEW = 0.06, 0.3  # decades, standard deviation of the smoothing: at least; times steps ** -0.2
 DEEP = 0.15  # of the lower mode's height: a valley below this is clean
-MIN_STILL, MIN_MOVING = 0.03, 0.05  # shares of the steps that make a mode
+MIN_STILL, MIN_MOVING, MIN_STEPS = 0.03, 0.05, 8  # shares of the steps, and number of them, that make a mode
 PLACE = 0.75  # position of the cut in the gap, 0 at the still mode and 1 at the moving one
-TICKS = 1.5  # encoder steps
+TICKS, MIN_TICKS = 1.5, 20  # encoder steps; how often a single one is seen where there are any
 WINDOW = 8  # steps, for the noise
 NOISE = 6.0  # standard deviations; a difference of two readings has 1.4, the largest of many joints some 3 of those
 QUIET = 0.5  # quantile of the noise over the windows at rest
@@ -164,8 +164,9 @@ class Motion:
                 clear=self._share(tick / 2) >= MIN_STILL,
             )
         careful = max(TICKS * tick, NOISE * noise)
-        most = max(TICKS * tick, _quantile(self._steps[1:], CAREFUL, below=int(self._steps[0])))
-        if careful > most > brisk * FLOOR:
+        tenth = _quantile(self._steps[1:], CAREFUL, below=int(self._steps[0]))
+        most = max(TICKS * tick, tenth, brisk * FLOOR)
+        if careful > most:
             return self._suggestion(
                 most,
                 f"No gap separates pauses from slow motion, and resting joints are noisy (about {noise:.2g}); the cut"
@@ -181,8 +182,8 @@ class Motion:
                 clear=False,
             )
         return self._suggestion(
-            NO_SIGN * brisk,
-            f"No sign of pauses; the cut is a hundredth of brisk motion ({brisk:.2g} a step).",
+            min(NO_SIGN * brisk, most),
+            f"No sign of pauses; the cut is at most a hundredth of brisk motion ({brisk:.2g} a step).",
             clear=False,
         )
 
@@ -223,7 +224,7 @@ class Motion:
                 continue
             tick = 10 ** (LOW + (first + used[0] + 0.5) / PER_DECADE)
             one, between = _between(counts, 0.9 * tick, 1.25 * tick), _between(counts, 1.25 * tick, 1.75 * tick)
-            if one >= 5 and between <= 0.05 * one:
+            if one >= MIN_TICKS and between <= 0.05 * one:
                 largest = max(largest, tick)
         return largest
 
@@ -285,14 +286,16 @@ def _gap(steps: Counts, floor: float) -> tuple[float, float] | None:
     used = int(np.flatnonzero(counts)[-1]) + 1 if counts.any() else 0
     if used < 3:
         return None
-    reach = int(4 * BLUR * PER_DECADE)
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (BLUR * PER_DECADE)) ** 2)
+    blur = PER_DECADE * max(BLUR, BLUR_FEW * float(counts.sum()) ** -0.2)  # few steps leave gaps by chance
+    reach = int(4 * blur)
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / blur) ** 2)
     padded = np.concatenate([np.zeros(reach), counts[:used], np.zeros(reach)])
     density = np.convolve(padded, kernel / kernel.sum(), mode="same")[reach:-reach]
-    share = np.cumsum(counts[:used]) / counts.sum()
+    below = np.cumsum(counts[:used])
+    share, above = below / below[-1], below[-1] - below
     left, right = np.maximum.accumulate(density), np.maximum.accumulate(density[::-1])[::-1]
     lower_mode = np.minimum(left, right)
-    allowed = (share >= MIN_STILL) & (share <= 1 - MIN_MOVING)
+    allowed = (share >= MIN_STILL) & (share <= 1 - MIN_MOVING) & (below >= MIN_STEPS) & (above >= MIN_STEPS)
     depth = np.where(allowed, density / np.maximum(lower_mode, 1e-9), np.inf)
     lowest = int(np.argmin(depth))
     if not depth[lowest] < DEEP:

@@ -5,7 +5,7 @@ LeRobot imports a policy's processors only when it makes new ones, not when it l
 """
 
 from .configuration_cqn import CQNConfig
-from .errors import ConfigError, CQNError, DataError, OutputExistsError
+from .errors import ConfigError, CQNError, DataError, OutputError, OutputExistsError
 from .processor_cqn import BoundObservationProcessorStep
 from .settings import PRESETS, CQNSettings
 
@@ -17,5 +17,6 @@ __all__ = [
     "CQNSettings",
     "ConfigError",
     "DataError",
+    "OutputError",
     "OutputExistsError",
 ]

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-__all__ = ["CQNError", "ConfigError", "DataError", "OutputExistsError", "one_of"]
+__all__ = ["CQNError", "ConfigError", "DataError", "OutputError", "OutputExistsError", "one_of"]
 
 
 class CQNError(Exception):
@@ -16,6 +16,10 @@ class ConfigError(CQNError, ValueError):
 
 class DataError(CQNError, ValueError):
     """A dataset or an observation is missing, empty, damaged, or of another shape than declared."""
+
+
+class OutputError(CQNError, OSError):
+    """A result cannot be written: the disk is full, or not ours to write to."""
 
 
 class OutputExistsError(CQNError, FileExistsError):

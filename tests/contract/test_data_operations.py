@@ -201,8 +201,8 @@ def test_resample_takes_the_right_pictures_and_last_commands(recording, tmp_path
 
 
 def test_resize_and_crop(recording, tmp_path, capsys):
-    dataset = run("resize", recording, tmp_path / "dst", "--size=[16, 16]", '--crop={"top": [0, 24, 48, 24]}')
-    assert tuple(dataset.meta.features[TOP]["shape"]) == (16, 16, 3)
+    dataset = run("resize", recording, tmp_path / "dst", "--size=[32, 32]", '--crop={"top": [0, 24, 48, 24]}')
+    assert tuple(dataset.meta.features[TOP]["shape"]) == (32, 32, 3)
     assert "squeezed" in capsys.readouterr().err
     for index in (0, 20, 62):  # only the right half is left
         shown = float(dataset[index][TOP].mean()) * 255
@@ -225,7 +225,7 @@ RECIPE = """
 steps:
   - filter: {threshold: 0.01}
   - delta: {}
-  - resize: {size: [24, 24]}
+  - resize: {size: [32, 32]}
   - label: {all: true}
   - bounds: {}
 """
@@ -249,7 +249,7 @@ def test_a_recipe_is_one_pass_and_equals_its_steps_one_by_one(recording, tmp_pat
         [
             ("filter", ["--threshold=0.01"]),
             ("delta", []),
-            ("resize", ["--size=[24,24]"]),
+            ("resize", ["--size=[32,32]"]),
             ("label", ["--all"]),
             ("bounds", []),
         ]
@@ -315,12 +315,12 @@ def damaged(recording, tmp_path):
 
 def test_a_broken_video_is_named_or_its_episode_skipped(recording, tmp_path, capsys):
     root, path = damaged(recording, tmp_path)
-    run("resize", root, tmp_path / "dst", "--size=[24,24]", code=2)
+    run("resize", root, tmp_path / "dst", "--size=[32,32]", code=2)
     said = last_line(capsys)
     assert str(path) in said
     assert "episode 1, frame" in said
     assert not (tmp_path / "dst").exists()
-    dataset = run("resize", root, tmp_path / "dst", "--size=[24,24]", "--skip_bad_episodes")
+    dataset = run("resize", root, tmp_path / "dst", "--size=[32,32]", "--skip_bad_episodes")
     assert "Left out episode 1" in capsys.readouterr().err
     assert [what(dataset[i][TOP])[1] for i in (0, 30)] == [0, 2]
     assert dataset.num_frames == LENGTHS[0] + LENGTHS[2]

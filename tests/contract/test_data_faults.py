@@ -1,0 +1,156 @@
+"""Kills, full disks and other misfortunes: the target is complete or absent, the source is as it was."""
+
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from lerobot.configs import RGBEncoderConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from cqn_data.cli import main
+
+CODE = "import sys; from cqn_data.cli import main; sys.exit(main(sys.argv[1:]))"
+SIDE, LENGTHS = 64, (40, 40, 40)
+# Shares of the time that an undisturbed run takes, at which the process is killed.
+MOMENTS = (0.05, 0.15, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.95, 1.0)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    root = tmp_path_factory.mktemp("faults") / "src"
+    vector = {"dtype": "float32", "shape": (2,), "names": ["pan.pos", "gripper.pos"]}
+    camera = {"dtype": "video", "shape": (SIDE, SIDE, 3), "names": ["height", "width", "channels"]}
+    features = {"observation.state": vector, "action": vector, "observation.images.top": camera}
+    encoder = RGBEncoderConfig(vcodec="h264", crf=5, g=2)
+    dataset = LeRobotDataset.create("local/src", 30, features, root=root, rgb_encoder=encoder)
+    rng = np.random.default_rng(0)
+    for length in LENGTHS:
+        for step in range(length):
+            state = np.array([0.1 * step, 0.0], np.float32)
+            picture = rng.integers(0, 255, (SIDE, SIDE, 3), np.uint8)
+            frame = {"observation.state": state, "action": state + 0.1, "observation.images.top": picture}
+            dataset.add_frame({**frame, "task": "go"})
+        dataset.save_episode(parallel_encoding=False)
+    dataset.finalize()
+    return root
+
+
+def snapshot(root):
+    return {str(p): (p.stat().st_mtime_ns, p.read_bytes()) for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+def start(source, target, *options, **more):
+    names = ["--repo_id=local/src", f"--root={source}", "--new_repo_id=local/dst", f"--new_root={target}"]
+    arguments = [sys.executable, "-c", CODE, "resize", *names, "--size=[32,32]", *options]
+    return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **more)
+
+
+def fork(source, target):
+    """The same in a copy of this process, which has everything imported already; returns its number."""
+    number = os.fork()
+    if number == 0:
+        code = 1
+        try:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            os.dup2(1, 2)
+            names = ["--repo_id=local/src", f"--root={source}", "--new_repo_id=local/dst", f"--new_root={target}"]
+            code = main(["resize", *names, "--size=[32,32]"])
+        finally:
+            os._exit(code)
+    return number
+
+
+def complete(target):
+    dataset = LeRobotDataset("local/dst", target)
+    assert (dataset.num_episodes, dataset.num_frames) == (3, sum(LENGTHS))
+    assert tuple(dataset[119]["observation.images.top"].shape) == (3, 32, 32)
+    assert json.loads((target / "meta/cqn_history.json").read_text())["operations"]
+
+
+def wait_for(condition, process, seconds=60):
+    """Until the condition holds or the process has ended."""
+    end = time.monotonic() + seconds
+    while not condition() and process.poll() is None:
+        assert time.monotonic() < end, "nothing happened"
+        time.sleep(0.002)
+
+
+def test_killed_at_any_moment_the_target_is_complete_or_absent_and_the_next_run_tidies_up(recording, tmp_path):
+    before = snapshot(recording)
+    target = tmp_path / "dst"
+    begun = time.monotonic()
+    process = fork(recording, target)
+    assert os.waitpid(process, 0)[1] == 0
+    took = time.monotonic() - begun
+    complete(target)
+    absent = left = 0
+    for moment in MOMENTS:
+        shutil.rmtree(target, ignore_errors=True)
+        process = fork(recording, target)
+        time.sleep(moment * took)
+        os.kill(process, signal.SIGKILL)
+        os.waitpid(process, 0)
+        if target.exists():
+            complete(target)
+        absent += not target.exists()
+        left += any(tmp_path.glob(".dst.*.tmp"))
+        assert snapshot(recording) == before
+    assert absent >= len(MOMENTS) // 3, "hardly any kill came in time; the moments are wrong"
+    assert left, "no kill left anything; the moments are wrong"
+    shutil.rmtree(target, ignore_errors=True)
+    (tmp_path / f".dst.{process}.tmp" / "videos").mkdir(parents=True, exist_ok=True)
+    done = start(recording, target)
+    _, err = done.communicate(timeout=120)
+    assert done.returncode == 0, err
+    assert "which a killed process left behind" in err
+    complete(target)
+    assert [p.name for p in tmp_path.iterdir()] == ["dst"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_by_a_person_it_leaves_nothing(recording, tmp_path, number):
+    target = tmp_path / "dst"
+    process = start(recording, target, start_new_session=True)
+    wait_for(lambda: any(tmp_path.glob(".dst.*.tmp/videos")), process)
+    os.kill(process.pid, number)
+    _, err = process.communicate(timeout=60)
+    if process.returncode == 0:
+        pytest.skip("it was done before the signal came")
+    assert process.returncode == 130
+    assert "nothing was written" in err
+    assert "Traceback" not in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_takes_no_more_is_named_in_one_line(recording, tmp_path):
+    def limit():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # write() fails instead, as on a full disk
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+
+    process = start(recording, tmp_path / "dst", preexec_fn=limit)  # noqa: PLW1509
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 2, err
+    assert err.count("\n") == 1, err
+    assert "could not be written" in err
+    assert "File too large" in err
+    assert not (tmp_path / "dst").exists()
+    assert not list(tmp_path.glob(".dst.*"))
+
+
+def test_two_runs_for_one_place_do_not_mix(recording, tmp_path):
+    target = tmp_path / "dst"
+    processes = [start(recording, target), start(recording, target)]
+    codes = []
+    for process in processes:
+        _, err = process.communicate(timeout=180)
+        codes.append(process.returncode)
+        assert "Traceback" not in err
+    assert sorted(codes) == [0, 2]
+    complete(target)
