@@ -1,7 +1,8 @@
 """Speed and memory of `cqn-data run paper_real_world` on a 4-camera 480x640 recording, against the plain way.
 
 The plain way reads `LeRobotDataset[i]` frame by frame, scales, and writes with LeRobot's default writer (PNG files,
-then a video); it is given the steps that stay, so that both do the same work. Peak memory is that of a process of its own.
+then a video); it is given the steps that stay, so that both do the same work. Peak memory is that of a process of its
+own.
 
     python -m benchmarks.data_recipe --frames=600 --csv=benchmarks/results/data_recipe.csv
 """

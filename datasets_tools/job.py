@@ -33,6 +33,10 @@ class Job:
     skip_bad_episodes: bool = option(
         False, help="Leave out episodes that cannot be read, instead of stopping; each is named."
     )
+    crf: int | None = option(
+        None,
+        help="Quality where videos are encoded anew, as the codec counts it: lower is better; by default as it was.",
+    )
     actions: str = option(
         "auto",
         help="What the actions are where the dataset's own history does not say: absolute, or deltas of one kind "
@@ -45,6 +49,8 @@ class Job:
 
         from .deltas import KINDS
 
+        if self.crf is not None and not 0 <= self.crf <= 63:
+            raise ConfigError(f"Expected --crf in [0, 63], got {self.crf}.")
         if self.actions not in (valid := ("auto", "absolute", *KINDS)):
             raise ConfigError(one_of("--actions", self.actions, valid))
 
@@ -136,7 +142,7 @@ def run_job(job: Job, steps: Sequence[Step], name: str | None = None) -> list[di
         result("Dry run: nothing was written.")
         return entries
     with progress() as bar:
-        written = write(view, new_repo_id, new_root, bar, skip=job.skip_bad_episodes)
+        written = write(view, new_repo_id, new_root, bar, skip=job.skip_bad_episodes, crf=job.crf)
     for episode, reason in written.skipped.items():
         note(f"Left out episode {episode}: {reason}")
     how = "videos copied as they were" if written.copied else "videos encoded anew" if source.meta.video_keys else ""

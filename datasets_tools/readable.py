@@ -37,10 +37,8 @@ def readable(source: Source, job: Job) -> View:
     """Read all numbers once, before any work begins.
 
     Raises:
-        DataError: a feature that cannot be carried over; or an episode that cannot be read, unless bad ones are
-            skipped; or no readable one.
+        DataError: an episode that cannot be read, unless bad ones are skipped; or no readable one.
     """
-    _refuse_unknown_kinds(source)
     bad: dict[int, str] = {}
     for index in source.episodes:
         try:
@@ -90,15 +88,3 @@ def _deltas(source: Source, job: Job) -> Deltas | None:
     if job.actions == "auto":
         return source.deltas
     return None if job.actions == "absolute" else Deltas(cast(Kind, job.actions), *match_joints(source))
-
-
-def _refuse_unknown_kinds(source: Source) -> None:
-    for key, feature in source.features.items():
-        if feature["dtype"] == "language" or key in source.meta.depth_keys:
-            kind = "language" if feature["dtype"] == "language" else "depth"
-            raise DataError(
-                f"Feature '{key}' is a {kind} column, which cannot be rewritten yet; take it out first with"
-                " lerobot-edit-dataset --operation.type=remove_feature."
-            )
-        if feature["dtype"] == "video" and (feature.get("info") or {}).get("has_audio"):
-            note(f"'{key}' has sound, which LeRobot does not keep when videos are encoded anew.")

@@ -41,9 +41,7 @@ alias. A camera may be named in full (observation.images.top) or by its last par
         from lerobot_cqn.errors import ConfigError
 
         if len(self.size) != 2 or not all(32 <= n <= 4096 for n in self.size):
-            raise ConfigError(
-                f"Expected --size='[HEIGHT, WIDTH]' with 32 to 4096 pixels each (video encoders fail below), got {self.size}."
-            )
+            raise ConfigError(f"Expected --size='[HEIGHT, WIDTH]' with 32 to 4096 pixels each, got {self.size}.")
         if any(n % 2 for n in self.size):
             raise ConfigError(f"Expected even numbers in --size, as video codecs do, got {self.size}.")
         for name, box in self.crop.items():

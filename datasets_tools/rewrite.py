@@ -17,7 +17,7 @@ from rich.progress import Progress
 
 from lerobot_cqn.errors import DataError
 
-from .source import Source
+from .source import NOT_NUMBERS, Source
 from .target import new_folder, write_history
 from .view import SOURCE_EPISODE, SOURCE_FRAME, Bounds, View
 
@@ -88,7 +88,7 @@ def _write_numbers(view: View, folder: Path, bar: Progress) -> dict[int, Stats]:
     source = view.source
     features = {**view.source.meta.features, **all_features(view)}
     schema = get_hf_features_from_features(features)
-    numbers = {k: f for k, f in all_features(view).items() if f["dtype"] not in ("image", "video")}
+    numbers = {k: f for k, f in all_features(view).items() if f["dtype"] not in NOT_NUMBERS}
     stats: dict[int, Stats] = {}
     line = bar.add_task("Writing episodes", total=len(view.episodes))
     for path, episodes in _partition(source):

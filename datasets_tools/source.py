@@ -23,6 +23,7 @@ from .view import Bounds, Camera, Episode, View, dimension_names
 __all__ = ["Source", "local_root", "open_source"]
 
 CACHE_BYTES = 256 * 2**20
+NOT_NUMBERS = ("image", "video", "language")  # what an episode does not hold in memory
 JITTER = 0.2  # share of a step by which a timestamp may be off
 
 
@@ -71,7 +72,7 @@ class Source(View):
     @property
     def cameras(self) -> dict[str, Camera]:
         """Every camera as it is."""
-        return {k: Camera() for k, f in self.features.items() if f["dtype"] in ("image", "video")}
+        return {k: Camera() for k in (*self.meta.video_keys, *self.meta.image_keys) if k not in self.meta.depth_keys}
 
     @property
     def deltas(self) -> Deltas | None:
@@ -148,7 +149,7 @@ class Source(View):
         _refuse_uneven(index, times, self.fps)
         columns: dict[str, Any] = {}
         for key, feature in self.features.items():
-            if feature["dtype"] not in ("image", "video"):
+            if feature["dtype"] not in NOT_NUMBERS:
                 columns[key] = _column(index, key, feature, table[key])
         names = self.meta.tasks.index
         tasks = [str(names[i]) for i in table["task_index"].to_pylist()]
@@ -237,7 +238,7 @@ def open_source(repo_id: str, root: str | None) -> Source:
 
 def _column(episode: int, key: str, feature: dict[str, Any], values: Any) -> Any:
     """(T, …) array of one column, or list of T strings."""
-    if feature["dtype"] in ("string", "language"):
+    if feature["dtype"] == "string":
         return values.to_pylist()
     flat = values.combine_chunks() if isinstance(values, pa.ChunkedArray) else values
     if isinstance(flat, pa.ChunkedArray):  # some versions keep an empty or extension column in chunks

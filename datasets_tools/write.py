@@ -37,7 +37,9 @@ class Written:
     skipped: dict[int, str] = field(default_factory=dict)
 
 
-def write(view: View, repo_id: str, root: Path, bar: Progress, *, skip: bool = False) -> Written:
+def write(
+    view: View, repo_id: str, root: Path, bar: Progress, *, skip: bool = False, crf: int | None = None
+) -> Written:
     """Write ``view`` to ``root``, complete or not at all.
 
     Args:
@@ -46,6 +48,7 @@ def write(view: View, repo_id: str, root: Path, bar: Progress, *, skip: bool = F
         root: its folder, which must not exist.
         bar: progress to show.
         skip: leave out episodes whose pictures cannot be read, instead of stopping.
+        crf: quality of new videos, as the codec counts it; None for the source's.
 
     Raises:
         DataError: nothing is left, or a picture cannot be read; names file, episode and frame.
@@ -60,26 +63,29 @@ def write(view: View, repo_id: str, root: Path, bar: Progress, *, skip: bool = F
     if pictures_unchanged(view):
         rewrite(view, repo_id, root, bar)
         return Written(len(lengths), sum(lengths.values()), copied=bool(view.source.meta.video_keys))
-    return _encode(view, repo_id, root, bar, lengths, skip)
+    return _encode(view, repo_id, root, bar, lengths, skip=skip, crf=crf)
 
 
 def pictures_unchanged(view: View) -> bool:
-    """Whether every frame of every episode stays, as it is and where it is, and there are pictures at all."""
+    """Whether every frame of every episode stays, as it is and where it is."""
     source = view.source
-    if not source.cameras or view.cameras != source.cameras or view.fps != source.fps:
+    if view.cameras != source.cameras or view.fps != source.fps:
         return False
     if list(view.episodes) != list(source.episodes):
         return False
     return all(len(view.episode(i)) == len(source.episode(i)) for i in view.episodes)
 
 
-def _encode(view: View, repo_id: str, root: Path, bar: Progress, lengths: dict[int, int], skip: bool) -> Written:
+def _encode(
+    view: View, repo_id: str, root: Path, bar: Progress, lengths: dict[int, int], *, skip: bool, crf: int | None
+) -> Written:
     source, done = view.source, Written()
+    _refuse_unknown_kinds(source)
     features = {k: {n: v for n, v in f.items() if n != "info"} for k, f in all_features(view).items()}
     _note_losses(source)
     line = bar.add_task("Writing frames", total=sum(lengths.values()))
     writer = new_dataset(
-        repo_id, root, fps=view.fps, features=features, robot_type=source.meta.robot_type, encoder=_encoder(source)
+        repo_id, root, fps=view.fps, features=features, robot_type=source.meta.robot_type, encoder=_encoder(source, crf)
     )
     with writer as target:
         kept: list[int] = []
@@ -117,8 +123,23 @@ def _finish(view: View, target: Target, kept: Sequence[int], done: Written) -> N
     write_history(target.folder, [*view.history(), *skipped])
 
 
-def _encoder(source: Source) -> Any:
+def _refuse_unknown_kinds(source: Source) -> None:
+    """LeRobot's writer takes neither annotations nor depth as they were read; copying them is no problem."""
+    for key, feature in source.features.items():
+        if feature["dtype"] == "language" or key in source.meta.depth_keys:
+            kind = "language" if feature["dtype"] == "language" else "depth"
+            raise DataError(
+                f"'{key}' is a {kind} column, which can be carried along only where every frame stays as it is (label,"
+                " delta, bounds); take it out first: lerobot-edit-dataset --operation.type=remove_feature."
+            )
+        if (feature.get("info") or {}).get("has_audio"):
+            note(f"The sound of '{key}' is lost: LeRobot does not keep it when videos are encoded anew.")
+
+
+def _encoder(source: Source, crf: int | None) -> Any:
     """The source's video settings, where this machine can encode them; else LeRobot's default."""
+    import dataclasses
+
     from lerobot.configs import RGBEncoderConfig
 
     settings = {k: source.meta.features[k].get("info") or {} for k in source.meta.video_keys}
@@ -127,10 +148,10 @@ def _encoder(source: Source) -> Any:
             encoder = RGBEncoderConfig.from_video_info(info)
         except ValueError:
             note("The source's video codec cannot be encoded here; LeRobot's default is used.")
-            return None
+            return None if crf is None else RGBEncoderConfig(crf=crf)
         if any(_codec(other) != _codec(info) for other in settings.values()):
             note(f"The cameras were encoded differently; all are written like '{key}'.")
-        return encoder
+        return encoder if crf is None else dataclasses.replace(encoder, crf=crf)
     return None
 
 

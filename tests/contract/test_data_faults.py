@@ -134,7 +134,7 @@ def test_a_disk_that_takes_no_more_is_named_in_one_line(recording, tmp_path):
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # write() fails instead, as on a full disk
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
 
-    process = start(recording, tmp_path / "dst", preexec_fn=limit)  # noqa: PLW1509
+    process = start(recording, tmp_path / "dst", preexec_fn=limit)
     _, err = process.communicate(timeout=120)
     assert process.returncode == 2, err
     assert err.count("\n") == 1, err

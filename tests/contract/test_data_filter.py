@@ -277,8 +277,10 @@ def test_a_failing_disk_leaves_nothing_and_says_so_in_one_line(plain, target, ca
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(LeRobotDataset, "save_episode", full)
-    assert run(plain, target) == 1
-    assert "No space left on device" in capsys.readouterr().err
+    assert run(plain, target) == 2
+    said = one_line(capsys)
+    assert "could not be written and nothing is left of it" in said
+    assert "No space left on device" in said
     assert not target.exists()
 
 

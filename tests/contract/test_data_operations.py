@@ -357,6 +357,45 @@ def test_files_that_are_not_understood_are_carried_or_named(recording, tmp_path,
     assert "Not carried over, since their meaning is unknown: meta/cameras.json" in capsys.readouterr().err
 
 
+def annotated(recording, tmp_path):
+    """A copy with the annotations that LeRobot keeps in a column of their own, as its own tool writes them."""
+    import datasets
+    from lerobot.datasets.language import language_persistent_column_feature
+
+    root = tmp_path / "annotated"
+    shutil.copytree(recording, root)
+    path = next((root / "data").rglob("*.parquet"))
+    table = datasets.Dataset.from_parquet(str(path), cache_dir=str(tmp_path / "cache"))
+    feature = language_persistent_column_feature()
+    row = dict.fromkeys(("role", "content", "style", "timestamp", "camera", "tool_calls"))
+    rows = [[{**row, "role": "user", "content": f"step {i}", "style": "plan"}] for i in range(len(table))]
+    column = datasets.Dataset.from_dict(
+        {"language_persistent": rows}, features=datasets.Features(language_persistent=feature)
+    )
+    datasets.concatenate_datasets([table, column], axis=1).to_parquet(str(path))
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"]["language_persistent"] = {"dtype": "language", "shape": [1], "names": None}
+    (root / "meta/info.json").write_text(json.dumps(info))
+    return root
+
+
+def test_annotations_are_carried_where_frames_stay_and_refused_by_name_elsewhere(recording, tmp_path, capsys):
+    root = annotated(recording, tmp_path)
+    dataset = run("label", root, tmp_path / "labelled", "--all")
+    assert dataset.hf_dataset.with_format(None)[40]["language_persistent"][0]["content"] == "step 40"
+    assert videos(root) == videos(tmp_path / "labelled")
+    run("drop", root, tmp_path / "dropped", "--episodes=[0]", code=2)
+    assert "'language_persistent' is a language column" in last_line(capsys)
+    assert not (tmp_path / "dropped").exists()
+
+
+def test_quality_of_new_videos_can_be_chosen(recording, tmp_path):
+    for crf in (5, 45):
+        run("resize", recording, tmp_path / str(crf), "--size=[32,32]", f"--crf={crf}")
+    sizes = {crf: sum(map(len, videos(tmp_path / str(crf)).values())) for crf in (5, 45)}
+    assert sizes[5] > sizes[45]
+
+
 def test_previews_are_written_once_and_show_what_goes(recording, tmp_path):
     import av
     from PIL import Image
