@@ -1,7 +1,6 @@
 """``cqn-data inspect``: a look at a dataset before anything is trained on it. Nothing in it is changed.
 
-``inspect_numbers``, ``inspect_follow`` and ``inspect_cameras`` measure, ``inspect_checks`` judges, ``inspect_page``
-shows.
+``inspection`` has what it measures (numbers, follow, cameras), judges (checks) and draws (page, svg).
 """
 
 import dataclasses
@@ -16,9 +15,9 @@ from .options import help_page, option, parse
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from .inspect_cameras import CameraLook
-    from .inspect_checks import Dataset, Finding
-    from .inspect_numbers import Numbers
+    from .inspection.cameras import CameraLook
+    from .inspection.checks import Dataset, Finding
+    from .inspection.numbers import Numbers
     from .source import Source
 
 __all__ = ["InspectConfig", "Inspection", "help", "inspect_dataset", "main"]
@@ -86,7 +85,7 @@ def main(args: list[str]) -> int:
 
     config = parse(InspectConfig, args)
     load_lerobot()
-    from .inspect_checks import Finding
+    from .inspection.checks import Finding
     from .source import open_source
     from .target import refuse_existing
 
@@ -118,9 +117,9 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
     """Measure and judge; what is damaged becomes a finding, and the rest is looked at all the same."""
     import numpy as np
 
-    from .inspect_cameras import look, missing_videos
-    from .inspect_checks import Dataset, findings
-    from .inspect_numbers import STATE, measure
+    from .inspection.cameras import look, missing_videos
+    from .inspection.checks import Dataset, findings
+    from .inspection.numbers import STATE, measure
 
     missing = missing_videos(source)
     with progress() as bar:
@@ -148,7 +147,7 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
 def _write_page(path: Path, inspection: Inspection) -> None:
     from lerobot_cqn.errors import OutputExistsError
 
-    from .inspect_page import page
+    from .inspection.page import page
 
     if inspection.dataset is None or inspection.numbers is None:
         return
@@ -162,8 +161,8 @@ def _write_page(path: Path, inspection: Inspection) -> None:
 
 
 def _show(inspection: Inspection) -> None:
-    from .inspect_checks import PAPER_SIZE, memory
-    from .inspect_page import overview, sentence_of_actions, size_text, verdict
+    from .inspection.checks import PAPER_SIZE, memory
+    from .inspection.page import overview, sentence_of_actions, size_text, verdict
 
     dataset, numbers = inspection.dataset, inspection.numbers
     if dataset is None or numbers is None:
@@ -220,7 +219,7 @@ def _print_json(config: InspectConfig, inspection: Inspection) -> None:
 
 def as_json(repo_id: str, inspection: Inspection) -> dict[str, Any]:
     """Plain types; the shape is the same whatever was found, with None for what could not be measured."""
-    from .inspect_checks import LEVELS, memory
+    from .inspection.checks import LEVELS, memory
 
     dataset, numbers, cameras = inspection.dataset, inspection.numbers, inspection.cameras
     report: dict[str, Any] = {

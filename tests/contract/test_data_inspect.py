@@ -15,7 +15,7 @@ from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
 
 from cqn_data.cli import main
 from cqn_data.inspect import as_json, inspect_dataset
-from cqn_data.inspect_checks import GIB
+from cqn_data.inspection.checks import GIB
 from cqn_data.source import open_source
 from lerobot_cqn.errors import DataError
 
@@ -318,7 +318,7 @@ def test_missing_and_broken_videos(film, tmp_path, capsys):
 
 
 def test_much_memory_is_mentioned(film, monkeypatch):
-    from cqn_data import inspect_checks
+    from cqn_data.inspection import checks as inspect_checks
 
     monkeypatch.setattr(inspect_checks, "GIB", GIB // 4096)
     assert "resize" in inspect(film)["memory"].advice

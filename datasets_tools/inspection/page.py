@@ -5,10 +5,10 @@ import html
 import io
 from collections.abc import Callable, Iterable, Sequence
 
-from .inspect_cameras import CameraLook
-from .inspect_checks import LEVELS, PAPER_SIZE, Dataset, Finding, memory
-from .inspect_numbers import STATE, Dimension, EpisodeNumbers, Numbers
-from .inspect_svg import pauses, spark, still_share, threshold_histogram
+from .cameras import CameraLook
+from .checks import LEVELS, PAPER_SIZE, Dataset, Finding, memory
+from .numbers import STATE, Dimension, EpisodeNumbers, Numbers
+from .svg import pauses, spark, still_share, threshold_histogram
 
 __all__ = ["page", "sentence_of_actions", "size_text", "verdict"]
 

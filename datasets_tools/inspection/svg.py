@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from .inspect_numbers import DRAWN, EpisodeNumbers
-from .threshold import Suggestion
+from ..threshold import Suggestion
+from .numbers import DRAWN, EpisodeNumbers
 
 __all__ = ["pauses", "spark", "still_share", "threshold_histogram"]
 

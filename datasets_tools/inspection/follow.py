@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.errors import DataError
 
-from .readable import match_joints
-from .source import Source
+from ..readable import match_joints
+from ..source import Source
 
 __all__ = ["Correlation", "Follow", "FollowKind"]
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from lerobot_cqn.schema import ACTION, NEXT_REWARD
 
-from .inspect_cameras import CameraLook
-from .inspect_numbers import STATE, Dimension, Numbers
+from .cameras import CameraLook
+from .numbers import STATE, Dimension, Numbers
 
 __all__ = ["LEVELS", "Dataset", "Finding", "Level", "Memory", "findings", "memory"]
 

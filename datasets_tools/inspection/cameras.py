@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .source import Source
-from .view import Camera
+from ..source import Source
+from ..view import Camera
 
 if TYPE_CHECKING:
-    from .inspect_numbers import EpisodeNumbers
+    from .numbers import EpisodeNumbers
 
 __all__ = ["CameraLook", "look", "missing_videos"]
 

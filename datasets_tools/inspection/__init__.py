@@ -1,0 +1,1 @@
+"""What `inspect` measures, judges and draws."""
