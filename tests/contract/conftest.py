@@ -4,7 +4,7 @@ import logging
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -13,6 +13,7 @@ from cqn_data.cli import main as cqn_data
 from cqn_train.cli import main as cqn_train
 
 from ..toy_datasets import make_dataset
+from .data_recording import make_recording
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -79,3 +80,16 @@ def straight(click: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path
     folder = tmp_path_factory.mktemp("straight") / "run"
     assert cqn_train([*TINY_RUN, *click, f"--output_dir={folder}"]) == 0
     return folder
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a small recording with a camera; see `data_recording`."""
+    return make_recording(tmp_path_factory.mktemp("recording") / "src")
+
+
+@pytest.fixture(autouse=True)
+def _logs_again() -> Iterator[None]:
+    """The dataset commands silence logging for the rest of their process; tests share one."""
+    yield
+    logging.disable(logging.NOTSET)

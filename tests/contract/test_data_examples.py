@@ -1,6 +1,5 @@
 """The examples that `--help` prints, run as printed on recordings of the names that they use."""
 
-import logging
 import os
 import re
 import shlex
@@ -14,17 +13,11 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from cqn_data.cli import OPERATIONS, main
 
 from .. import foreign_formats
-from .test_data_operations import RECIPE
+from .data_recording import RECIPE
 
 NAMES = ["pan.pos", "lift.pos", "gripper.pos"]
 ELSEWHERE = {"push", "record"}  # the network; and a minute of simulation, which the walk through the docs has
 OUTPUTS = ("--new_root", "--html", "--preview", "--report")
-
-
-@pytest.fixture(autouse=True)
-def _logs():
-    yield
-    logging.disable(logging.NOTSET)
 
 
 def examples(operation, capsys):

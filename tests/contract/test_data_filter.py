@@ -1,7 +1,6 @@
 """`cqn-data filter` on small datasets written by LeRobot: what comes out, and what must never happen."""
 
 import json
-import logging
 import os
 import signal
 from pathlib import Path
@@ -18,12 +17,6 @@ FPS = 10
 STILL = {3, 4, 5, 9}  # steps that lead nowhere
 STATE = {"dtype": "float32", "shape": (3,), "names": ["a.pos", "b.pos", "gripper.pos"]}
 SCALAR = {"dtype": "float32", "shape": (1,), "names": None}
-
-
-@pytest.fixture(autouse=True)
-def _logs():
-    yield
-    logging.disable(logging.NOTSET)
 
 
 def write(root, episodes=2, steps=14, still=STILL, extra=None, values=None, spoil=None):

@@ -28,12 +28,6 @@ CQN = [*TINY_POLICY, "--policy.preset=paper_real_world", "--policy.push_to_hub=f
        "--num_workers=0", "--log_freq=1"]  # fmt: skip
 
 
-@pytest.fixture(autouse=True)
-def _logs():
-    yield
-    logging.disable(logging.NOTSET)
-
-
 def scene(rng):
     """A picture that survives compression: soft blobs."""
     small = rng.integers(0, 255, (6, 8, 3), np.uint8)
