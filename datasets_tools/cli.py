@@ -31,6 +31,7 @@ OPERATIONS = {
     "bounds": "set the action bounds that training scales by",
     "drop": "leave out whole episodes, by number or by rule",
     "run": "run several of these as one pass over the videos, from a recipe",
+    "push": "upload a dataset to the Hugging Face Hub, with a card that tells how it came about",
 }
 
 

@@ -26,8 +26,9 @@ cqn-data filter --repo_id=local/click --root=data/click \\
     --new_repo_id=local/click_filtered --new_root=data/click_filtered --threshold=0.005
 """
     notes = """
-A step is a pause when it leads to a state in which no joint differs by its threshold from where the last kept step
-led; slow motion adds up and is kept. Gripper changes, rewards and the last step of each episode are always kept.
+A step is a pause when no joint differs by its threshold from the next step that is kept: it leads nowhere. So the step
+that ends a pause stays, and slow motion adds up. Gripper changes, rewards and the last step of each episode are always
+kept. Filtering again with the same threshold drops nothing.
 Delta actions are formed anew, so that they connect the states that are left.
 """
 
@@ -56,7 +57,7 @@ Delta actions are formed anew, so that they connect the states that are left.
     )
     skip_short: bool = option(False, help="Leave out episodes that would keep fewer than --min_steps.")
     compare: str = option(
-        "after", help="Compare the states that steps lead to (after) or start from (before; keeps 'stay' actions)."
+        "after", help="Compare with the next kept step (after) or the last one (before; keeps 'stay' actions)."
     )
     preview: str | None = option(
         None, help="Show what goes: FILE.mp4 (dropped frames in red) or FILE.png (curves of the joints)."
@@ -136,15 +137,10 @@ Delta actions are formed anew, so that they connect the states that are left.
                 raise ConfigError(one_of("joint", name, [states[i] for i in joints]))
         if not gripper_state and not gripper_action:
             note('No dimension is named "gripper", so gripper changes are not protected; name it with --gripper_names.')
-        threshold, why = (0.005 if self.threshold is None else self.threshold), {}
+        threshold = 0.005 if self.threshold is None else self.threshold
+        why: dict[str, Any] = {}
         if self.auto:
-            from .threshold import suggest
-
-            found = suggest(view.episode(i).columns[STATE][:, list(joints)] for i in view.episodes)
-            threshold, why = found.threshold, {"why": found.reason, "clear": found.clear}
-            result(f"Threshold {threshold:.4g}: {found.reason}")
-            if not found.clear:
-                note("Look at the histogram (cqn-data inspect) and give --threshold where you know better.")
+            threshold, why = _choose(view, joints)
         return Rule(
             joints=joints,
             thresholds=tuple(self.joint_thresholds.get(states[i], threshold) for i in joints),
@@ -168,6 +164,23 @@ Delta actions are formed anew, so that they connect the states that are left.
                 f"In {pushing} of the dropped steps the command moved while the arm did not: contact, or the start of a"
                 " motion. For contact tasks take a smaller --threshold."
             )
+
+
+def _choose(view: "View", joints: tuple[int, ...]) -> tuple[float, dict[str, Any]]:
+    """A threshold from the data, and why; the earlier one where the pauses it would be read from are gone."""
+    from .deltas import STATE
+    from .threshold import suggest
+
+    for entry in reversed(view.history()):
+        if entry.get("operation") == "filter" and "threshold" in entry.get("settings", {}):
+            reason = "as in the earlier filter, since most pauses to judge by are gone."
+            result(f"Threshold {entry['settings']['threshold']:.4g}: {reason}")
+            return float(entry["settings"]["threshold"]), {"why": reason}
+    found = suggest(view.episode(i).columns[STATE][:, list(joints)] for i in view.episodes)
+    result(f"Threshold {found.threshold:.4g}: {found.reason}")
+    if not found.clear:
+        note("Look at the histogram (cqn-data inspect) and give --threshold where you know better.")
+    return found.threshold, {"why": found.reason, "clear": found.clear}
 
 
 def help() -> str:

@@ -4,12 +4,12 @@ Shapes: T time steps of one episode, S state dimensions, A action dimensions. Un
 
 Why the rule looks at where a step *leads*. Step t holds the state s[t] and the action a[t] that brings the arm
 to s[t+1]. In a pause s[t] stays the same while a[t] keeps it there; the last of those steps has the same state
-too, but its action is the one that moves on. Comparing the states a step *starts* from would keep the first
-still step (action: stay) and drop that last one (action: go on), which teaches a policy to stay for ever.
-Comparing the states it leads to drops the "stay" steps only. For two kept neighbours k < k' every step between
-them led to within the threshold of s[k+1], hence s[k'] = s[k+1] up to the threshold: the kept action a[k] still
-explains the motion to the next kept step. So delta actions (increments, zero in a pause) stay valid without being
-summed, and so do absolute ones (targets), which never depended on the spacing of steps.
+too, but its action is the one that moves on. Looking for the first step with another state than the last kept one
+would keep the first still step (action: stay) and drop that last one (action: go on), which teaches a policy to stay
+for ever. So the episode is read from its end: a step is kept when its state differs from that of the *next* kept
+step, that is, when it leads somewhere. For two kept neighbours k < k' every step between them is within the
+threshold of s[k'], and so is what a[k] led to: the kept action explains the motion to the next kept step. Slow
+motion adds up. Since only kept steps are compared, doing it again drops nothing.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.errors import DataError
 
-__all__ = ["Compare", "EpisodeReport", "Rule", "keep_mask", "pause_runs", "report_episode"]
+__all__ = ["Compare", "EpisodeReport", "Rule", "gripper_events", "keep_mask", "pause_runs", "report_episode"]
 
 type Mask = NDArray[np.bool_]
 type Compare = Literal["after", "before"]
@@ -41,7 +41,7 @@ class Rule:
         keep_first: steps at the start that are always kept; >= 0.
         keep_last: steps at the end that are always kept; >= 1, for the last one carries the reward.
         min_pause: shorter pauses are left in; >= 1 step.
-        compare: "after" compares the states that steps lead to, "before" those that they start from.
+        compare: "after" compares with the next kept step, "before" with the last one.
     """
 
     joints: tuple[int, ...]
@@ -102,9 +102,9 @@ class EpisodeReport:
 def keep_mask(state: NDArray[Any], action: NDArray[Any], rule: Rule, always: Mask | None = None) -> Mask:
     """Mark the steps to keep.
 
-    A step is a pause when no joint differs by its threshold or more from the last kept step. Since the comparison
-    is with the last *kept* step, slow motion adds up and is kept as soon as it passes the threshold. Steps at which
-    the gripper changes, state or command, are kept; so are ``always``, the first and the last steps asked for.
+    A step is a pause when no joint differs by its threshold or more from the next kept step (compare="before": from the
+    last kept one). Steps at which the gripper changes, state or command, are kept; so are ``always``, the first and the
+    last steps asked for. The steps that are kept, taken for an episode of their own, would all be kept again.
 
     Args:
         state: (T, S) measured state.
@@ -121,10 +121,24 @@ def keep_mask(state: NDArray[Any], action: NDArray[Any], rule: Rule, always: Mas
     steps = len(state)
     if steps == 0 or len(action) != steps:
         raise DataError(f"Expected as many actions as states and at least one; got {len(action)} and {steps}.")
-    forced = np.zeros(steps, dtype=bool) if always is None else always.copy()
+    wanted = np.zeros(steps, dtype=bool) if always is None else always
+    rows: NDArray[np.int64] = np.arange(steps)
+    while True:  # what goes may bring two gripper positions together that a step between them had kept apart
+        mask = _keep_once(state[rows], action[rows], rule, wanted[rows])
+        rows = rows[mask]
+        if mask.all():
+            break
+    keep = np.zeros(steps, dtype=bool)
+    keep[rows] = True
+    return keep
+
+
+def _keep_once(state: NDArray[Any], action: NDArray[Any], rule: Rule, always: Mask) -> Mask:
+    steps = len(state)
+    forced = always | gripper_events(state, action, rule)
     forced[: rule.keep_first] = True
     forced[max(0, steps - max(1, rule.keep_last)) :] = True
-    keep = forced | _moves(state, action, rule, forced)[0]
+    keep = _moves(state, rule, forced)
     for start, length in pause_runs(keep):
         if length < rule.min_pause:
             keep[start : start + length] = True
@@ -155,7 +169,7 @@ def report_episode(
         rule: the rule it came from.
         commanded: (T, J) commanded joint positions, where the data has them.
     """
-    events = _moves(state, action, rule, keep)[1]
+    events = gripper_events(state, action, rule)
     near = np.zeros_like(keep)
     for step in np.flatnonzero(events):
         near[max(0, step - NEAR_GRIPPER) : step + NEAR_GRIPPER + 1] = True
@@ -176,21 +190,28 @@ def _pushing(commanded: NDArray[Any], keep: Mask, rule: Rule) -> int:
     return int((~keep & (changes >= min(rule.thresholds, default=np.inf))).sum())
 
 
-def _moves(state: NDArray[Any], action: NDArray[Any], rule: Rule, forced: Mask) -> tuple[Mask, Mask]:
-    """(T,) steps at which joints or gripper changed since the last kept step, and those of the gripper alone."""
+def gripper_events(state: NDArray[Any], action: NDArray[Any], rule: Rule) -> Mask:
+    """(T,) steps whose command, or the state that they lead to, has the gripper elsewhere than the last such step."""
     states, actions = np.asarray(state, dtype=np.float64), np.asarray(action, dtype=np.float64)
-    after = rule.compare == "after"
-    seen = np.concatenate([states[1:], states[-1:]]) if after else states
-    joints = seen[:, list(rule.joints)]
+    seen = np.concatenate([states[1:], states[-1:]]) if rule.compare == "after" else states
     grippers = np.concatenate([seen[:, list(rule.gripper_state)], actions[:, list(rule.gripper_action)]], axis=1)
-    limits = np.asarray(rule.thresholds, dtype=np.float64)
-    last_joints = states[0, list(rule.joints)]
-    last_gripper = np.concatenate([states[0, list(rule.gripper_state)], actions[0, list(rule.gripper_action)]])
-    moved, events = np.zeros(len(states), dtype=bool), np.zeros(len(states), dtype=bool)
+    last = np.concatenate([states[0, list(rule.gripper_state)], actions[0, list(rule.gripper_action)]])
+    events = np.zeros(len(states), dtype=bool)
     for t in range(len(states)):
-        events[t] = bool((np.abs(grippers[t] - last_gripper) > rule.gripper_threshold).any())
-        first = t == 0 and not after
-        moved[t] = first or bool(events[t] or (np.abs(joints[t] - last_joints) >= limits).any())
-        if moved[t] or forced[t]:
-            last_joints, last_gripper = joints[t], grippers[t]
-    return moved, events
+        if (np.abs(grippers[t] - last) > rule.gripper_threshold).any():
+            events[t], last = True, grippers[t]
+    return events
+
+
+def _moves(state: NDArray[Any], rule: Rule, forced: Mask) -> Mask:
+    """(T,) steps that are forced, or at which a joint differs from the kept step next to them."""
+    joints = np.asarray(state, dtype=np.float64)[:, list(rule.joints)]
+    limits = np.asarray(rule.thresholds, dtype=np.float64)
+    order = range(len(joints) - 1, -1, -1) if rule.compare == "after" else range(len(joints))
+    keep = forced.copy()
+    last: NDArray[np.float64] | None = None
+    for t in order:
+        keep[t] = keep[t] or last is None or bool((np.abs(joints[t] - last) >= limits).any())
+        if keep[t]:
+            last = joints[t]
+    return keep

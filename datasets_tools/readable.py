@@ -48,7 +48,7 @@ def readable(source: Source, job: Job) -> View:
         except DataError as error:
             if not job.skip_bad_episodes:
                 raise
-            bad[index] = str(error)
+            bad[index] = source.without_place(str(error))
             note(f"Left out episode {index}: {error}")
     if len(bad) == len(source.episodes):
         raise DataError(f"{source.root}: not one episode can be read; the last one: {bad[max(bad)]}")

@@ -119,6 +119,10 @@ class Source(View):
         """File that holds the episode's pictures of a camera stored as video."""
         return self.root / str(self.meta.get_video_file_path(episode, key))
 
+    def without_place(self, text: str) -> str:
+        """A sentence for the history, which others will read: files without the folder of this machine."""
+        return text.replace(f"{self.root}/", "")
+
     def check_videos(self, episodes: Sequence[int] | None = None) -> None:
         """Make sure that every video file is there.
 

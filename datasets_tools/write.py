@@ -100,7 +100,7 @@ def _encode(
                 if not skip:
                     raise
                 target.drop_episode()
-                done.skipped[index] = str(error)
+                done.skipped[index] = source.without_place(str(error))
         if not kept:
             raise DataError(f"Not one episode could be read; the last one: {done.skipped[max(done.skipped)]}")
         _finish(view, target, kept, done)

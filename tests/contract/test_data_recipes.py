@@ -108,6 +108,7 @@ def test_a_broken_video_is_named_or_its_episode_skipped(recording, tmp_path, cap
     assert [what(dataset[i][TOP])[1] for i in (0, 30)] == [0, 2]
     assert dataset.num_frames == LENGTHS[0] + LENGTHS[2]
     assert list(history(tmp_path / "dst")[-1]["episodes"]) == ["1"]
+    assert str(tmp_path) not in json.dumps(history(tmp_path / "dst"))
 
 
 def test_uneven_times_and_missing_numbers_name_episode_and_frame(recording, tmp_path, capsys):

@@ -41,32 +41,45 @@ def rules(draw):
     )
 
 
-def oracle(state, action, rule, always):
-    """The rule once more, step by step in plain Python, as the help text tells it."""
+def differ(a, b, limits):
+    return any(abs(x - y) >= limit for x, y, limit in zip(a, b, limits, strict=True))
+
+
+def oracle_once(state, action, rule, always):
+    """The rule once more, in plain Python, as the help text tells it; returns the kept steps."""
     total = len(state)
-    kept = []
-    where = None if rule.compare == "before" else (list(state[0, :2]), state[0, 2], action[0, 2])
+    after = rule.compare == "after"
+    hands = [(state[min(t + 1, total - 1) if after else t, 2], action[t, 2]) for t in range(total)]
+    hand, kept = (state[0, 2], action[0, 2]), set()
     for t in range(total):
-        row = state[t] if rule.compare == "before" or t == total - 1 else state[t + 1]
-        here = (list(row[:2]), row[2], action[t, 2])
-        keep = t < rule.keep_first or t >= total - rule.keep_last or bool(always[t]) or where is None
-        if not keep:
-            keep = any(abs(a - b) >= limit for a, b, limit in zip(here[0], where[0], rule.thresholds, strict=True))
-            keep = keep or abs(here[1] - where[1]) > rule.gripper_threshold
-            keep = keep or abs(here[2] - where[2]) > rule.gripper_threshold
-        if keep:
-            kept.append(t)
-            where = here
-    mask = [t in kept for t in range(total)]
+        if any(abs(x - y) > rule.gripper_threshold for x, y in zip(hands[t], hand, strict=True)):
+            hand = hands[t]
+            kept.add(t)
+    kept |= {t for t in range(total) if t < rule.keep_first or t >= total - rule.keep_last or always[t]}
+    for t in reversed(range(total)) if after else range(total):
+        others = [k for k in sorted(kept) if (k > t if after else k < t)]
+        beside = None if not others else others[0] if after else others[-1]
+        if t not in kept and (beside is None or differ(state[t, :2], state[beside, :2], rule.thresholds)):
+            kept.add(t)
     t = 0
     while t < total:
         end = t
-        while end < total and not mask[end]:
+        while end < total and end not in kept:
             end += 1
         if 0 < end - t < rule.min_pause:
-            mask[t:end] = [True] * (end - t)
+            kept |= set(range(t, end))
         t = end + 1
-    return mask
+    return sorted(kept)
+
+
+def oracle(state, action, rule, always):
+    """Until nothing more goes."""
+    rows = list(range(len(state)))
+    while True:
+        kept = oracle_once(state[rows], action[rows], rule, [always[r] for r in rows])
+        if len(kept) == len(rows):
+            return [t in rows for t in range(len(state))]
+        rows = [rows[k] for k in kept]
 
 
 @settings(max_examples=200, deadline=None)
@@ -81,6 +94,26 @@ def test_mask_equals_the_oracle(episode, rule, random):
     assert all(length >= rule.min_pause for _, length in pause_runs(mask))
     report = report_episode(0, state, action, mask, rule)
     assert report.dropped == sum(length for _, length in report.runs) == (~mask).sum()
+
+
+@settings(max_examples=200, deadline=None)
+@given(episodes(), rules(), st.randoms(use_true_random=False))
+def test_doing_it_again_drops_nothing(episode, rule, random):
+    state, action = episode
+    always = np.array([random.random() < 0.1 for _ in state])
+    mask = keep_mask(state, action, rule, always)
+    assert keep_mask(state[mask], action[mask], rule, always[mask]).all()
+
+
+@settings(max_examples=100, deadline=None)
+@given(episodes(gripper=False))
+def test_dropped_steps_are_where_the_next_kept_step_is(episode):
+    state, action = episode
+    mask = keep_mask(state, action, Rule((0, 1), (THRESHOLD, THRESHOLD), (2,), (2,), 0.1))
+    kept = np.flatnonzero(mask)
+    for step in np.flatnonzero(~mask):
+        beside = kept[np.searchsorted(kept, step)]
+        assert np.abs(state[step, :2] - state[beside, :2]).max() < THRESHOLD
 
 
 @settings(max_examples=100, deadline=None)

@@ -1,0 +1,220 @@
+"""``cqn-data push``: a dataset and a card that tells its history, to the Hugging Face Hub."""
+
+import dataclasses
+import re
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .console import load_lerobot, note, result, table
+from .options import help_page, option, parse
+
+if TYPE_CHECKING:
+    from .card import Facts, Labels
+    from .hub import Hub, Sent
+
+__all__ = ["PushConfig", "help", "main"]
+
+SUMMARY = "upload a dataset to the Hugging Face Hub, with a card that tells how it came about"
+EXAMPLE = """
+cqn-data push --repo_id=user/pick --root=data/pick_cqn --dry_run
+cqn-data push --repo_id=user/pick --root=data/pick_cqn --private --tags='[ur5e, click]'
+"""
+NOTES = """
+Log in first: hf auth login. The folder is never changed. One commit makes all files visible together, and a run that
+broke off goes on where it was. README.md: what you wrote there stays; the part between two marks is written anew.
+Files of data/, meta/ and videos/ on the Hub that the folder does not have are removed; the repository's history keeps
+them. The tag of the format (v3.0), which LeRobot loads by default, moves along, but not with --branch.
+"""
+README = "README.md"
+NAME = re.compile(r"[A-Za-z0-9](?:[\w.-]{0,94}[A-Za-z0-9])?", re.ASCII)
+LICENSE = re.compile(r"[a-z0-9][a-z0-9.-]*")
+BRANCH = re.compile(r"(?![/.-])(?!.*(?:\.\.|//|@\{))[\w./-]+(?<![/.])", re.ASCII)
+SHOWN = 40  # files named one by one
+
+
+@dataclasses.dataclass
+class PushConfig:
+    """Settings of ``cqn-data push``."""
+
+    repo_id: str = option(help="Name on the Hub, as user/name.")
+    root: str | None = option(None, help="Folder of the dataset; by default LeRobot's home and the repo_id.")
+    private: bool = option(False, help="Make a new repository private; refused where it is there already and public.")
+    license: str | None = option(None, help="Licence for the card; by default the card's own, else apache-2.0.")
+    tags: list[str] = dataclasses.field(
+        default_factory=list,
+        metadata={"help": "Tags for the card, e.g. '[ur5e, click]', besides LeRobot and cqn-data."},
+    )
+    branch: str | None = option(None, help="Branch to push to, made where it is missing; by default main.")
+    message: str | None = option(None, help="Message of the commit.")
+    dry_run: bool = option(False, help="Show the card and what would be uploaded; needs neither network nor login.")
+
+    def validate(self) -> None:
+        """Check forms; raises ConfigError naming the option, what was expected and what was found."""
+        from lerobot_cqn.errors import ConfigError
+
+        parts = self.repo_id.split("/")
+        if len(parts) != 2 or not all(NAME.fullmatch(p) and "--" not in p and ".." not in p for p in parts):
+            raise ConfigError(
+                "Expected --repo_id=user/name of letters, digits, '-', '_' and '.' (not doubled, not at the ends), got"
+                f" '{self.repo_id}'."
+            )
+        if self.license is not None and not LICENSE.fullmatch(self.license):
+            raise ConfigError(f"Expected --license as on the Hub, e.g. apache-2.0 or cc-by-4.0, got '{self.license}'.")
+        for tag in self.tags:
+            if not tag.strip() or len(tag) > 100 or not tag.isprintable():
+                raise ConfigError(f"Expected --tags of 1 to 100 printable characters each, got {tag!r}.")
+        if self.branch is not None and not BRANCH.fullmatch(self.branch):
+            raise ConfigError(f"Expected --branch as git allows it, e.g. filtered, got '{self.branch}'.")
+        if self.message is not None and not self.message.strip():
+            raise ConfigError("Expected --message with some text; leave it out for the usual one.")
+
+
+def help() -> str:
+    """Help page."""
+    return help_page("push", SUMMARY, PushConfig, EXAMPLE, NOTES)
+
+
+def main(args: list[str]) -> None:
+    """Run from the command line.
+
+    Raises:
+        ConfigError: an option is unknown or has a wrong form.
+        DataError: the dataset is missing, damaged or not complete, or its README.md cannot be read.
+        HubError: nobody is logged in, or the Hub refused or could not be reached.
+        Interrupted: Ctrl-C while sending.
+    """
+    config = parse(PushConfig, args)
+    config.validate()
+    if not config.dry_run:
+        from .hub import refuse_to_start
+
+        refuse_to_start()
+    load_lerobot()
+    from .card import Labels, look, write_card
+    from .source import open_source
+
+    source = open_source(config.repo_id, config.root)
+    source.check_videos()
+    facts = look(source)
+    branch = None if config.branch == "main" else config.branch
+    labels = Labels(config.repo_id, config.license, tuple(config.tags), branch, config.private)
+    files = _files(source.root)
+    own = _own_card(source.root)
+    _warn_of_folders(source.root)
+    card = write_card(facts, labels, own)
+    if config.dry_run:
+        _show(files, card, config.repo_id)
+        return
+    from .hub import Hub
+
+    hub = Hub(config.repo_id, shlex.join(["cqn-data", "push", *args]), branch)
+    hub.prepare(private=config.private)
+    card = _merged_card(hub, facts, labels, own)
+    hub.check_card(card)
+    size = sum(path.stat().st_size for path in files.values())
+    note(f"Sending {len(files)} files, {_megabytes(size)}, and the card to {config.repo_id} ({hub.branch}).")
+    episodes = f"{len(facts.lengths)} episodes, {sum(facts.lengths)} steps"
+    sent = hub.send({**files, README: card.encode()}, config.message or f"cqn-data push: {episodes}")
+    version = str(source.meta.info.codebase_version)
+    sent.tagged = branch is None and hub.tag(version)
+    _report(sent, config.repo_id, branch, version)
+
+
+def _files(root: Path) -> "dict[str, Path]":
+    """Path in the repository -> file: everything but the card, hidden files and pictures left over from recording."""
+    found: dict[str, Path] = {}
+    for path in sorted(root.rglob("*")):
+        inside = path.relative_to(root)
+        hidden = any(part.startswith(".") for part in inside.parts)
+        if path.is_file() and not hidden and inside.parts[0] != "images" and str(inside) != README:
+            found[inside.as_posix()] = path
+    return found
+
+
+def _own_card(root: Path) -> str | None:
+    from lerobot_cqn.errors import DataError
+
+    path = root / README
+    if not path.is_file():
+        return None
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} cannot be read as UTF-8 text: {error}") from error
+
+
+def _merged_card(hub: "Hub", facts: "Facts", labels: "Labels", own: str | None) -> str:
+    """The card from what lies in the folder or else on the Hub; says what it does to a card of a person."""
+    from lerobot_cqn.errors import DataError
+
+    from .card import START, own_text, write_card
+
+    there = hub.text(README)
+    if own is None:
+        if there is not None and START not in there:
+            note("The README.md on the Hub keeps its text; what the dataset is and its history are added below it.")
+        try:
+            return write_card(facts, labels, there)
+        except DataError as error:
+            raise DataError(f"On the Hub: {error} Mend it there, or put a README.md into the folder.") from error
+    if START not in own:
+        note("README.md keeps its text; what the dataset is and its history are added below it, on the Hub only.")
+    card = write_card(facts, labels, own)
+    try:
+        replaced = there is not None and own_text(there) != own_text(card)
+    except DataError:  # it was not readable
+        replaced = True
+    if replaced:
+        note("The README.md on the Hub is replaced by the folder's; its old text stays in the repository's history.")
+    return card
+
+
+def _show(files: Mapping[str, Path], card: str, repo_id: str) -> None:
+    result(card)
+    sizes = {path: file.stat().st_size for path, file in files.items()} | {README: len(card.encode())}
+    shown: dict[str, list[int]] = {}
+    for path, size in sorted(sizes.items()):
+        shown.setdefault(path if len(sizes) <= SHOWN else _folder(path), []).append(size)
+    rows = [[name, str(len(all_)), f"{sum(all_):,}"] for name, all_ in shown.items()]
+    table(["file" if len(sizes) <= SHOWN else "folder", "files", "bytes"], rows,
+          ["total", str(len(sizes)), f"{sum(sizes.values()):,}"])  # fmt: skip
+    result(f"Dry run: nothing was sent to {repo_id}.")
+
+
+def _folder(path: str) -> str:
+    return "/".join(path.split("/")[:-1][:2]) + "/" if "/" in path else path
+
+
+def _warn_of_folders(root: Path) -> None:
+    """Say when the history that goes along names folders of this machine."""
+    from .target import HISTORY
+
+    path = root / HISTORY
+    if not path.is_file():
+        return
+    text = path.read_text(encoding="utf-8")
+    named = [folder for folder in (str(root.resolve()), str(Path.home())) if len(folder) > 1 and folder in text]
+    if named:
+        note(f"{HISTORY} names a folder of this machine ({named[0]}), and goes to the Hub as it is.")
+
+
+def _report(sent: "Sent", repo_id: str, branch: str | None, version: str) -> None:
+    if sent.removed:
+        some = ", ".join(sent.removed[:3]) + (", …" if len(sent.removed) > 3 else "")
+        note(f"Removed {len(sent.removed)} files that the dataset no longer has: {some}; the history keeps them.")
+    counts = f"{len(sent.new)} new and {len(sent.changed)} changed files, {_megabytes(sent.size)}"
+    if not (sent.new or sent.changed or sent.removed):
+        counts = "nothing new"
+    result(f"Pushed {repo_id}: {counts}; {len(sent.same)} were there already.")
+    if branch is not None:
+        result(f'Load it with LeRobotDataset("{repo_id}", revision="{branch}"). The tag {version} was left alone.')
+    else:
+        moved = f"The tag {version} names this state" + ("" if sent.tagged else " already")
+        result(f'{moved}: LeRobotDataset("{repo_id}") loads it.')
+    result(sent.url)
+
+
+def _megabytes(size: int) -> str:
+    return f"{size / 1e6:.1f} MB"
