@@ -1,8 +1,9 @@
 """Checkpoints in LeRobot's layout, written whole or not at all, and everything a resumed run needs.
 
 output_dir/checkpoints/<env step>/pretrained_model/   what lerobot-eval loads
-                                 /training_state/     optimiser, counters, random state, online episodes
+                                 /training_state/     optimiser, counters, random state
 output_dir/checkpoints/last -> <env step>
+output_dir/replay/                                    the episodes, written as they end (storage.py)
 """
 
 import json
@@ -20,7 +21,6 @@ from lerobot_cqn.errors import DataError
 from lerobot_cqn.learner import Learner
 
 from .agent import Agent
-from .replay import Replay
 
 __all__ = ["Counters", "last_checkpoint", "restore", "save"]
 
@@ -51,11 +51,9 @@ def save(
     output_dir: Path,
     agent: Agent,
     learner: Learner,
-    replay: Replay,
     rng: np.random.Generator,
     counters: Counters,
     *,
-    first_online: int,
     tables: dict[str, int],
     run_config: dict[str, Any],
 ) -> Path:
@@ -74,7 +72,6 @@ def save(
     # Exploration draws on the policy's device, everything else on the CPU.
     devices = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
     torch.save([torch.get_rng_state(), *devices], state / "torch_rng.pt")
-    replay.save(state / "online_episodes.npz", first_online)
     progress = {"counters": asdict(counters), "tables": tables, "numpy_rng": rng.bit_generator.state}
     (state / "progress.json").write_text(json.dumps(progress))
     old = folder / f".{target.name}.old"
@@ -91,13 +88,10 @@ def save(
     return target
 
 
-def restore(
-    checkpoint: Path, learner: Learner, replay: Replay, rng: np.random.Generator
-) -> tuple[Counters, dict[str, int]]:
-    """Optimiser, online episodes and random state; returns counters and table sizes. Weights load with the policy."""
+def restore(checkpoint: Path, learner: Learner, rng: np.random.Generator) -> tuple[Counters, dict[str, int]]:
+    """Optimiser and random state; returns counters and table sizes. Weights load with the policy."""
     state = checkpoint / "training_state"
     learner.load_state_dict(torch.load(state / "optimizer.pt", weights_only=True))
-    replay.load(state / "online_episodes.npz")
     progress = json.loads((state / "progress.json").read_text())
     rng.bit_generator.state = progress["numpy_rng"]
     cpu, *devices = torch.load(state / "torch_rng.pt", weights_only=True)
@@ -132,7 +126,7 @@ def _link_or_copy(source: str, destination: str) -> None:
 
 
 def _forget_old_states(folder: Path, newest: Path) -> None:
-    """Keep every policy, but optimiser and episodes only of the newest checkpoint."""
+    """Keep every policy, but the optimiser only of the newest checkpoint."""
     for other in folder.iterdir():
         if other.is_dir() and not other.is_symlink() and other.name.isdigit() and other != newest:
             shutil.rmtree(other / "training_state", ignore_errors=True)

@@ -1,11 +1,13 @@
 """`cqn-train`: parse, check, put the parts together, run. The only composition root."""
 
+import contextlib
 import logging
+import shutil
 import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Self
@@ -56,13 +58,17 @@ def build(config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], 
     agent = make_agent(config, checkpoint)
     check_fits(config.env, agent.policy)
     s = config.policy.settings
-    replay = Replay(s.frame_stack, s.n_step, s.discount)
-    if config.dataset.repo_id:
-        monitor.phase("load", 1, 0)
-        for episode in load_episodes(config.dataset, agent, lambda i, n: monitor.advance(i, f"episode {i}/{n}")):
-            replay.add(episode, demo=episode.success)
-    demonstrations = replay.episodes
     env = GymEnvironment(config.env, config.policy)
+    replay = Replay(
+        s.frame_stack, s.n_step, s.discount, folder=config.output_dir / "replay",
+        capacity_gib=config.replay.capacity_gib, by_step=config.replay.sampling == "steps",
+    )  # fmt: skip
+    with _nothing_left(None if config.resume else config.output_dir):
+        if config.dataset.repo_id:
+            monitor.phase("load", 1, 0)
+            for episode in load_episodes(config.dataset, agent, lambda i, n: monitor.advance(i, f"episode {i}/{n}")):
+                replay.add_demonstration(episode)
+        finished = replay.reopen() if checkpoint is not None else []
     config.output_dir.mkdir(parents=True, exist_ok=True)
     run_config = draccus.encode(config)
     wandb = None
@@ -71,18 +77,34 @@ def build(config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], 
     metrics = Metrics(config.output_dir, wandb)
     learner, counters = Learner(agent.policy.model), Counters()
     if checkpoint is not None:
-        counters, tables = restore(checkpoint, learner, replay, rng)
+        counters, tables = restore(checkpoint, learner, rng)
         metrics.truncate(tables)
+        finished = [place for place in finished if place.number >= counters.episodes]
         monitor.message(f"Resuming at step {counters.env_steps}, {counters.updates} updates.")
 
     def save_checkpoint() -> None:
         assert config.output_dir is not None  # noqa: S101
         save(
-            config.output_dir, agent, learner, replay, rng, counters,
-            first_online=demonstrations, tables=metrics.sizes(), run_config=run_config,
+            config.output_dir, agent, learner, rng, counters, tables=metrics.sizes(), run_config=run_config,
         )  # fmt: skip
 
-    return Trainer(config, agent, learner, env, replay, metrics, monitor, rng, counters, save_checkpoint, should_stop)
+    return Trainer(
+        config, agent, learner, env, replay, metrics, monitor, rng, counters, save_checkpoint, should_stop,
+        finished_since=finished,
+    )  # fmt: skip
+
+
+@contextlib.contextmanager
+def _nothing_left(folder: Path | None) -> Iterator[None]:
+    """Remove the new run's folder when its beginning fails, so that the same command can be given again."""
+    try:
+        yield
+    except BaseException:
+        if folder is not None:
+            shutil.rmtree(folder / "replay", ignore_errors=True)
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
 
 
 def make_agent(config: RunConfig, checkpoint: Path | None) -> Agent:

@@ -8,9 +8,9 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_cqn.configuration_cqn import CQNConfig
-from lerobot_cqn.errors import ConfigError
+from lerobot_cqn.errors import ConfigError, one_of
 
-__all__ = ["DatasetSettings", "EvalSettings", "RunConfig", "WandBSettings"]
+__all__ = ["DatasetSettings", "EvalSettings", "ReplaySettings", "RunConfig", "WandBSettings"]
 
 # Update schedule and batches of each policy preset (table 2); presets that are not here use the first.
 _SCHEDULES: dict[str, dict[str, int]] = {
@@ -39,6 +39,14 @@ class EvalSettings:
     freq: int = 1000  # environment steps between evaluations; 0: only after the offline phase and at the end
     n_episodes: int = 20  # of each evaluation on the way
     final_n_episodes: int = 50  # after the offline phase and at the end
+
+
+@dataclass
+class ReplaySettings:
+    """Where experience is kept: in output_dir/replay, on disk, so that a kill loses no finished episode."""
+
+    capacity_gib: float = 16.0  # of the demonstrations and the run's episodes together; the oldest make room
+    sampling: str = "episodes"  # uniform over episodes, then over their steps (the reference's); or over "steps"
 
 
 @dataclass
@@ -73,6 +81,7 @@ class RunConfig:
     save_freq: int = 5000  # environment steps between checkpoints; the end and an interrupt always save
     log_freq: int = 50  # updates between rows of updates.csv
     threads: int = 0  # torch threads; 0 leaves torch's choice
+    replay: ReplaySettings = field(default_factory=ReplaySettings)
     eval: EvalSettings = field(default_factory=EvalSettings)
     wandb: WandBSettings = field(default_factory=WandBSettings)
 
@@ -97,6 +106,10 @@ class RunConfig:
                 raise ConfigError(f"`{name}` must be at least {least}, got {value}.")
         if self.eval.final_n_episodes < 1 or self.eval.n_episodes < 1:
             raise ConfigError("`eval.n_episodes` and `eval.final_n_episodes` must be at least 1.")
+        if not 0 < self.replay.capacity_gib < float("inf"):
+            raise ConfigError(f"`replay.capacity_gib` must be positive and finite, got {self.replay.capacity_gib}.")
+        if self.replay.sampling not in (valid := ("episodes", "steps")):
+            raise ConfigError(one_of("replay.sampling", self.replay.sampling, valid))
 
     @property
     def schedule(self) -> dict[str, int]:

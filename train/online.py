@@ -1,7 +1,8 @@
 """The loop: offline updates on the demonstrations, then acting and learning (Algorithm 2)."""
 
+import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -16,6 +17,7 @@ from .evaluate import Evaluation, evaluate
 from .interfaces import Environment
 from .metrics import Metrics
 from .replay import Replay
+from .storage import Place
 
 __all__ = ["Interrupted", "Monitor", "Trainer"]
 
@@ -56,10 +58,12 @@ class Trainer:
     save: Callable[[], None]
     should_stop: Callable[[], bool]
     evaluations: list[tuple[str, Evaluation]] = field(default_factory=list)
+    finished_since: Sequence[Place] = ()
     _clock: float = field(default_factory=time.monotonic)
 
     def run(self) -> None:
         """Offline phase, online phase, final evaluation. Raises Interrupted between two updates or steps."""
+        self.take_up(self.finished_since)
         if not self.counters.offline_done:
             self._offline()
         self._online()
@@ -69,9 +73,7 @@ class Trainer:
     def _offline(self) -> None:
         total = self.config.offline_updates
         self.monitor.phase("offline", total, self.counters.updates)
-        while self.counters.updates < total:
-            self.update()
-            self.monitor.advance(self.counters.updates, "")
+        self.updates(total - self.counters.updates, on_update=lambda: self.monitor.advance(self.counters.updates, ""))
         if total and self.config.steps:
             self.evaluate("offline", self.config.eval.final_n_episodes)
         self.counters.offline_done = True
@@ -87,8 +89,7 @@ class Trainer:
             except Interrupted:  # the unfinished episode is dropped, so its steps do not count either
                 c.env_steps = before
                 raise
-            for _ in range(self.config.schedule["updates_per_episode"]):
-                self.update()
+            self.updates(self.config.schedule["updates_per_episode"])
             if freq and c.env_steps // freq > before // freq and c.env_steps < self.config.steps:
                 self.evaluate("online", self.config.eval.n_episodes)
             if c.env_steps // self.config.save_freq > before // self.config.save_freq:
@@ -110,33 +111,47 @@ class Trainer:
             recorder.observe(prepared)
             q_values.append(q)
             c.env_steps += 1
-            for _ in range(self.config.schedule["updates_per_step"]):
-                self.update()
+            self.updates(self.config.schedule["updates_per_step"])
             if self.should_stop():
                 raise Interrupted
             if outcome.terminated or outcome.truncated:
                 break
         episode = recorder.episode(terminated=outcome.terminated, success=outcome.success)
-        self.replay.add(episode, demo=self.config.relabel and outcome.success)
+        demo = self.config.relabel and outcome.success
         row = {
             "episode": c.episodes, "length": len(episode), "success": int(outcome.success),
             "return": float(episode.reward.sum()), "mean_q": float(np.mean(q_values)),
-            "demonstrations": self.replay.demonstrations,
+            "demonstrations": self.replay.demonstrations + demo, **self._progress(),
         }  # fmt: skip
+        self.replay.add(episode, demo=demo, number=c.episodes, note=row)
         c.episodes += 1
-        self.metrics.write("episodes", row | self._progress())
+        self.metrics.write("episodes", row)
         self.monitor.advance(c.env_steps, f"episode {c.episodes}  Q {row['mean_q']:+.2f}")
 
-    def update(self) -> None:
-        """One gradient update on a batch from both stores."""
-        schedule = self.config.schedule
-        batch = self.replay.sample(schedule["batch_size"], schedule["demo_batch_size"], self.rng)
-        stats = self.learner.update(batch)
-        self.counters.updates += 1
-        if self.counters.updates % self.config.log_freq == 0:
-            self.metrics.write("updates", {name: float(value) for name, value in stats.items()} | self._progress())
-        if self.should_stop():
-            raise Interrupted
+    def updates(self, count: int, on_update: Callable[[], None] = lambda: None) -> None:
+        """Gradient updates on batches from both stores, the next one put together meanwhile."""
+        sizes = self.config.schedule["batch_size"], self.config.schedule["demo_batch_size"]
+        with contextlib.closing(self.replay.batches(count, *sizes, self.rng)) as batches:
+            for batch in batches:
+                stats = self.learner.update(batch)
+                self.counters.updates += 1
+                if self.counters.updates % self.config.log_freq == 0:
+                    losses = {name: float(value) for name, value in stats.items()}
+                    self.metrics.write("updates", losses | self._progress())
+                on_update()
+                if self.should_stop():
+                    raise Interrupted
+
+    def take_up(self, places: Sequence[Place]) -> None:
+        """Episodes that were finished after the last checkpoint: they count, and their updates are made again."""
+        schedule, owed = self.config.schedule, 0
+        for place in places:
+            self.metrics.write("episodes", place.note)
+            self.counters.episodes, self.counters.env_steps = place.number + 1, int(place.note["env_steps"])
+            owed += place.length * schedule["updates_per_step"] + schedule["updates_per_episode"]
+        if places:
+            self.monitor.message(f"{len(places)} episodes after the last checkpoint are kept; {owed} updates again.")
+        self.updates(owed)
 
     def evaluate(self, phase: str, episodes: int) -> None:
         """Success rate of the deterministic policy; its random state is kept apart from training's."""

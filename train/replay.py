@@ -1,5 +1,8 @@
 """Replay buffer: whole episodes, stored once; histories and n-step windows are put together when sampled."""
 
+import json
+from collections.abc import Generator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,10 +11,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lerobot_cqn.errors import DataError
+from lerobot_cqn.errors import ConfigError, DataError
 from lerobot_cqn.schema import Batch, Observation
 
+from .storage import Journal, Place, Rows
+
 __all__ = ["Episode", "Replay"]
+
+GIB = 2**30
+BATCHES = 4  # whose pictures are in memory at a time
 
 
 @dataclass(frozen=True)
@@ -35,174 +43,288 @@ class Episode:
         """Steps, T."""
         return len(self.action)
 
-
-class _Rows:
-    """A growing array; doubling keeps appending cheap."""
-
-    def __init__(self) -> None:
-        self._data: NDArray[Any] | None = None
-        self.size = 0
-
-    def check(self, rows: NDArray[Any]) -> None:
-        if self._data is not None and rows.shape[1:] != self._data.shape[1:]:
-            raise DataError(f"Rows of shape {rows.shape[1:]} do not fit a replay of {self._data.shape[1:]}.")
-
-    def append(self, rows: NDArray[Any]) -> None:
-        if self._data is None:
-            self._data = np.empty((max(1024, len(rows)), *rows.shape[1:]), rows.dtype)
-        if self.size + len(rows) > len(self._data):
-            grown = np.empty((max(2 * len(self._data), self.size + len(rows)), *rows.shape[1:]), rows.dtype)
-            grown[: self.size] = self._data[: self.size]
-            self._data = grown
-        self._data[self.size : self.size + len(rows)] = rows
-        self.size += len(rows)
-
-    def __getitem__(self, index: Any) -> NDArray[Any]:
-        assert self._data is not None  # noqa: S101
-        rows: NDArray[Any] = self._data[: self.size][index]
-        return rows
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What is stored, T + 1 rows each: a row of its own for the last observation keeps one index for all."""
+        state = self.low_dim if self.low_dim is not None else np.zeros((len(self) + 1, 0), np.float32)
+        rows = {"low_dim": state.astype(np.float32)}
+        for name, values in (("action", self.action), ("reward", self.reward)):
+            rows[name] = np.concatenate([values, np.zeros_like(values[:1])]).astype(np.float32)
+        return rows | {f"view_{i}": view for i, view in enumerate(self.pixels)}
 
 
 class Replay:
     """Everything seen, with the demonstrations (and relabelled successes) flagged.
 
-    Both stores of the paper are views of one: a sample comes from all episodes or from the flagged ones,
-    uniform over episodes and then over the steps of that episode.
+    Both stores of the paper are views of one: a sample comes from all episodes or from the flagged ones. The
+    demonstrations of the dataset come first and stay; behind them episodes go round in a ring, the oldest
+    making room once the capacity is used up.
     """
 
-    def __init__(self, frame_stack: int, n_step: int, discount: float) -> None:
+    def __init__(
+        self,
+        frame_stack: int,
+        n_step: int,
+        discount: float,
+        *,
+        folder: Path | None = None,
+        capacity_gib: float = 16.0,
+        by_step: bool = False,
+    ) -> None:
+        """An empty replay.
+
+        Args:
+            frame_stack: S >= 1 observations of history.
+            n_step: n >= 1.
+            discount: of a step, (0, 1].
+            folder: of its files, which survive a kill; None keeps everything in memory.
+            capacity_gib: GiB of all rows together, demonstrations included; > 0.
+            by_step: sample uniformly over time steps; else over episodes first, then over their steps.
+        """
         self.frame_stack, self.n_step, self.discount = frame_stack, n_step, discount
-        self._low_dim = _Rows()
-        self._pixels: tuple[_Rows, ...] = ()
-        self._action, self._reward = _Rows(), _Rows()
-        self._start: list[int] = []
-        self._length: list[int] = []
-        self._terminated: list[bool] = []
-        self._success: list[bool] = []
-        self._demo: list[bool] = []
+        self.folder, self.by_step = folder, by_step
+        self._capacity_bytes = int(capacity_gib * GIB)
+        self._rows: dict[str, Rows] = {}
+        self._places: list[Place] = []
+        self._fixed = 0  # episodes of the dataset
+        self._ring = 0  # first row behind them
+        self._head = 0  # where the next episode goes
+        self._reserved = 0
+        self._tables: dict[str, NDArray[Any]] = {}
+        self._buffers: dict[tuple[int, str], torch.Tensor] = {}
+        self._turn = 0
+        self._journal: Journal | None = None
+        if folder is not None:
+            self._journal = Journal(folder / "episodes.jsonl")
 
     @property
     def episodes(self) -> int:
         """Episodes stored."""
-        return len(self._start)
+        return len(self._places)
 
     @property
     def demonstrations(self) -> int:
         """Episodes flagged as demonstrations."""
-        return sum(self._demo)
+        return sum(place.demo for place in self._places)
 
     @property
     def steps(self) -> int:
         """Time steps stored."""
-        return sum(self._length)
+        return sum(place.length for place in self._places)
 
-    def add(self, episode: Episode, *, demo: bool) -> None:
-        """Store an episode. Raises DataError when it is empty, not finite, or of another shape."""
-        if not len(episode):
-            raise DataError("An episode needs at least one step, got none.")
-        low_dim = episode.low_dim if episode.low_dim is not None else np.zeros((len(episode) + 1, 0), np.float32)
-        for name, values in (("state", low_dim), ("action", episode.action), ("reward", episode.reward)):
-            if not np.isfinite(values).all():
-                raise DataError(f"Episode {self.episodes} holds NaN or infinite values in its {name}.")
-        if not self._pixels:
-            self._pixels = tuple(_Rows() for _ in episode.pixels)
-        # All shapes before the first row is written: a refused episode must leave nothing behind.
-        for rows, new in zip(
-            (self._low_dim, self._action, self._reward, *self._pixels),
-            (low_dim, episode.action, episode.reward, *episode.pixels),
-            strict=True,
-        ):
-            rows.check(new)
-        self._start.append(self._action.size)
-        # A row of its own for the last observation keeps one index for all arrays.
-        self._action.append(np.concatenate([episode.action, np.zeros_like(episode.action[:1])]))
-        self._reward.append(np.concatenate([episode.reward, np.zeros_like(episode.reward[:1])]))
-        self._low_dim.append(low_dim.astype(np.float32))
-        for rows, view in zip(self._pixels, episode.pixels, strict=True):
-            rows.append(view)
-        self._length.append(len(episode))
-        self._terminated.append(episode.terminated)
-        self._success.append(episode.success)
-        self._demo.append(demo)
+    @property
+    def bytes_per_step(self) -> int:
+        """Bytes of a row: one uint8 frame a view, state, action and reward; 0 while it is empty."""
+        return sum(rows.row_bytes for rows in self._rows.values())
+
+    @property
+    def capacity(self) -> int:
+        """Rows that fit; an episode takes one more than it has steps."""
+        return self._capacity_bytes // max(1, self.bytes_per_step)
+
+    def add_demonstration(self, episode: Episode) -> None:
+        """Store an episode of the dataset, for good. Raises DataError as `add`; ConfigError when it does not fit."""
+        if self.episodes > self._fixed:
+            raise DataError("Demonstrations of the dataset come before the first episode of the run.")
+        arrays = self._checked(episode)
+        start, stop = self._ring, self._ring + len(episode) + 1
+        if stop > self.capacity:
+            raise ConfigError(
+                f"The demonstrations need more than --replay.capacity_gib={self._capacity_bytes / GIB:g}: raise it, or"
+                " make the pictures smaller (cqn-data resize)."
+            )
+        self._write(arrays, start, stop)
+        self._keep(Place(start, len(episode), episode.terminated, episode.success, episode.success))
+        self._fixed, self._ring, self._head = self.episodes, stop, stop
+
+    def add(self, episode: Episode, *, demo: bool, number: int = -1, note: dict[str, Any] | None = None) -> None:
+        """Store an episode of the run; the oldest ones make room.
+
+        number, note: kept with it on disk, for a resumed run.
+        Raises DataError when it is empty, not finite, or of another shape; ConfigError when it can never fit.
+        """
+        arrays = self._checked(episode)
+        start = self._head if self._head + len(episode) + 1 <= self.capacity else self._ring
+        place = Place(start, len(episode), episode.terminated, episode.success, demo, number, note or {})
+        if place.stop > self.capacity:
+            raise ConfigError(
+                f"An episode of {len(episode)} steps does not fit behind the demonstrations: raise"
+                f" --replay.capacity_gib={self._capacity_bytes / GIB:g}."
+            )
+        if self._journal is not None and self.folder is not None:
+            if not (self.folder / "layout.json").is_file():
+                (self.folder / "layout.json").write_text(json.dumps(self._layout()))
+            self._journal.announce(place.start, place.stop)
+        self._evict(place.start, place.stop)
+        self._write(arrays, place.start, place.stop)
+        if self._journal is not None:
+            self._journal.complete(place)
+        self._keep(place)
+        self._head = place.stop
 
     def sample(self, count: int, demo_count: int, rng: np.random.Generator) -> Batch:
         """`count` transitions from everything followed by `demo_count` from the demonstrations.
 
+        Their pictures lie in memory that is used again: a batch is good until three more have been sampled.
         Raises DataError when a store that is asked for is empty.
         """
-        everything, demos = np.arange(self.episodes), np.flatnonzero(self._demo)
+        return self._assemble(*self._draw(count, demo_count, rng))
+
+    def batches(self, updates: int, count: int, demo_count: int, rng: np.random.Generator) -> Generator[Batch]:
+        """`updates` samples, the next one put together while one is in use; errors surface at the next one.
+
+        The same batches as from `sample`, and the same state of `rng` wherever the iteration ends.
+        """
+        with ThreadPoolExecutor(1) as pool:
+            ahead, before = None, rng.bit_generator.state
+            try:
+                for index in range(updates):
+                    batch = ahead.result() if ahead is not None else self.sample(count, demo_count, rng)
+                    before, ahead = rng.bit_generator.state, None
+                    if index + 1 < updates:
+                        ahead = pool.submit(self._assemble, *self._draw(count, demo_count, rng))
+                    yield batch
+            finally:
+                if ahead is not None:  # drawn, but not used
+                    rng.bit_generator.state = before
+
+    def _draw(self, count: int, demo_count: int, rng: np.random.Generator) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Episodes [B] and steps [B]."""
+        tables = self._table()
+        everything, demos = np.arange(self.episodes), np.flatnonzero(tables["demo"])
         if (count and not len(everything)) or (demo_count and not len(demos)):
             raise DataError(
                 f"Cannot sample {count} + {demo_count}: the replay holds {len(everything)} episodes, of which "
                 f"{len(demos)} are demonstrations; give a dataset or set the batch size of the empty store to 0."
             )
-        parts = [rng.choice(ids, size) for ids, size in ((everything, count), (demos, demo_count)) if size]
+        parts = []
+        for ids, size in ((everything, count), (demos, demo_count)):
+            weights = tables["length"][ids] / tables["length"][ids].sum() if self.by_step and size else None
+            parts += [rng.choice(ids, size, p=weights)] if size else []
         episode = np.concatenate(parts)
-        length = np.asarray(self._length)[episode]
-        step = rng.integers(0, length)
-        return self._assemble(episode, step)
+        return episode, rng.integers(0, tables["length"][episode])
 
     def _assemble(self, episode: NDArray[Any], step: NDArray[Any]) -> Batch:
         """Transitions at the given steps [B] of the given episodes [B]."""
-        start, length = np.asarray(self._start)[episode], np.asarray(self._length)[episode]
+        tables = self._table()
+        start, length = tables["start"][episode], tables["length"][episode]
         window = np.minimum(self.n_step, length - step)  # never past the end of the episode
         offsets = np.arange(self.n_step)
         inside = offsets < window[:, None]
-        rewards = self._reward[(start + step)[:, None] + np.where(inside, offsets, 0)] * inside
+        rewards = self._rows["reward"].take((start + step)[:, None] + np.where(inside, offsets, 0)).numpy() * inside
         reward = (rewards * self.discount**offsets).sum(-1, keepdims=True)
-        ended = (step + window == length) & np.asarray(self._terminated)[episode]
+        ended = (step + window == length) & tables["terminated"][episode]
         discount = np.where(ended, 0.0, self.discount**window)[:, None]
-        demo = np.asarray(self._demo)[episode][:, None]
         return Batch(
             self._observation(start, step),
-            torch.from_numpy(self._action[start + step]),
+            self._rows["action"].take(start + step),
             torch.from_numpy(reward.astype(np.float32)),
             torch.from_numpy(discount.astype(np.float32)),
             self._observation(start, step + window),
-            torch.from_numpy(demo.astype(np.float32)),
+            torch.from_numpy(tables["demo"][episode][:, None].astype(np.float32)),
         )
 
     def _observation(self, start: NDArray[Any], step: NDArray[Any]) -> Observation:
         """Stacked history that ends at `step`; before the first frame, the first frame is repeated."""
         back = np.arange(self.frame_stack - 1, -1, -1)
         rows = start[:, None] + np.maximum(step[:, None] - back, 0)  # [B, S]
-        low_dim = self._low_dim[rows]  # [B, S, P]
-        views = tuple(torch.from_numpy(view[rows]).flatten(1, 2) for view in self._pixels)
-        return Observation(views, torch.from_numpy(low_dim).flatten(1) if low_dim.shape[-1] else None)
+        low_dim = self._rows["low_dim"].take(rows)  # [B, S, P]
+        views = []
+        for name in (name for name in self._rows if name.startswith("view_")):
+            buffer = self._turn % (2 * BATCHES), name  # an observation and a next one for each batch
+            self._buffers[buffer] = self._rows[name].take(rows, self._buffers.get(buffer))
+            views.append(self._buffers[buffer].flatten(1, 2))
+        self._turn += 1
+        return Observation(tuple(views), low_dim.flatten(1) if low_dim.shape[-1] else None)
 
-    # -- to disk and back ------------------------------------------------------------------------------------
+    # -- rows and places -------------------------------------------------------------------------------------
 
-    def save(self, path: Path, first_episode: int = 0) -> None:
-        """Write the episodes from `first_episode` on (the demonstrations come from their dataset again)."""
-        first_row = self._start[first_episode] if first_episode < self.episodes else self._action.size
-        arrays: dict[str, Any] = {
-            "length": np.asarray(self._length[first_episode:], dtype=np.int64),
-            "terminated": np.asarray(self._terminated[first_episode:], dtype=bool),
-            "success": np.asarray(self._success[first_episode:], dtype=bool),
-            "demo": np.asarray(self._demo[first_episode:], dtype=bool),
-        }
-        if len(arrays["length"]):
-            arrays |= {"action": self._action[first_row:], "reward": self._reward[first_row:]}
-            arrays |= {"low_dim": self._low_dim[first_row:]}
-            arrays |= {f"view_{i}": rows[first_row:] for i, rows in enumerate(self._pixels)}
-        np.savez(path, **arrays)
+    def _checked(self, episode: Episode) -> dict[str, NDArray[Any]]:
+        """The arrays of an episode that fits; the first one decides shapes."""
+        if not len(episode):
+            raise DataError("An episode needs at least one step, got none.")
+        arrays = episode.arrays()
+        for name, what in (("low_dim", "state"), ("action", "action"), ("reward", "reward")):
+            if not np.isfinite(arrays[name]).all():
+                raise DataError(f"Episode {self.episodes} holds NaN or infinite values in its {what}.")
+        if not self._rows:
+            self._rows = {
+                name: Rows(self.folder / f"{name}.bin" if self.folder else None, values.shape[1:], values.dtype)
+                for name, values in arrays.items()
+            }
+        for name, values in arrays.items():
+            if name not in self._rows or values.shape[1:] != self._rows[name].shape:
+                held = self._rows[name].shape if name in self._rows else "none"
+                raise DataError(f"Rows of shape {values.shape[1:]} do not fit a replay of {held} ('{name}').")
+        return arrays
 
-    def load(self, path: Path) -> None:
-        """Add the episodes that `save` wrote."""
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = dict(stored)
-        views = [arrays[f"view_{i}"] for i in range(sum(name.startswith("view_") for name in arrays))]
-        row = 0
-        for index, length in enumerate(arrays["length"]):
-            rows, steps = slice(row, row + length + 1), slice(row, row + length)
-            low_dim = arrays["low_dim"][rows]
-            episode = Episode(
-                low_dim if low_dim.shape[1] else None,
-                tuple(view[rows] for view in views),
-                arrays["action"][steps],
-                arrays["reward"][steps],
-                bool(arrays["terminated"][index]),
-                bool(arrays["success"][index]),
+    def _write(self, arrays: dict[str, NDArray[Any]], start: int, stop: int) -> None:
+        if stop > self._reserved:
+            self._reserved = min(self.capacity, max(1024, stop, 2 * self._reserved))
+            for rows in self._rows.values():
+                rows.reserve(self._reserved)
+        for name, values in arrays.items():
+            self._rows[name].write(start, values)
+
+    def _evict(self, start: int, stop: int) -> None:
+        """Forget the episodes of the run that lie in these rows."""
+        kept = [p for i, p in enumerate(self._places) if i < self._fixed or p.stop <= start or p.start >= stop]
+        if len(kept) < len(self._places):
+            self._places, self._tables = kept, {}
+
+    def _keep(self, place: Place) -> None:
+        self._places.append(place)
+        self._tables = {}
+
+    def _table(self) -> dict[str, NDArray[Any]]:
+        """Places as arrays, [episodes] each."""
+        if not self._tables:
+            columns = ("start", "length", "terminated", "demo")
+            self._tables = {name: np.array([getattr(p, name) for p in self._places]) for name in columns}
+        return self._tables
+
+    # -- after a kill ----------------------------------------------------------------------------------------
+
+    def _layout(self) -> dict[str, Any]:
+        """What must be the same when a run is resumed: rows of the demonstrations, capacity, shapes."""
+        shapes = {name: [*rows.shape, str(rows.dtype)] for name, rows in self._rows.items()}
+        return {"ring": self._ring, "capacity": self.capacity, "shapes": shapes}
+
+    def reopen(self) -> list[Place]:
+        """Take up the finished episodes of an earlier process; call once the demonstrations are in.
+
+        Returns all that are still there, oldest first. Raises DataError when the dataset or the settings changed, or
+        the files are damaged.
+        """
+        if self.folder is None or self._journal is None:
+            raise DataError("This replay has no folder to take episodes up from.")
+        layout = self.folder / "layout.json"
+        written = json.loads(layout.read_text()) if layout.is_file() else None
+        if self._rows and written is not None and written != self._layout():
+            raise DataError(
+                f"{self.folder} was laid out for another dataset or --replay.capacity_gib: resume with those that the"
+                " run began with, or start a new run."
             )
-            self.add(episode, demo=bool(arrays["demo"][index]))
-            row += length + 1
+        self._journal.repair()
+        for (start, stop), place in self._journal.entries():
+            self._evict(start, stop)
+            if place is not None:
+                self._keep(place)
+                self._head = place.stop
+        if written is not None:
+            self._restore(written)
+        return self._places[self._fixed :]
+
+    def _restore(self, written: dict[str, Any]) -> None:
+        """Map the rows of the episodes that were taken up; without demonstrations their shapes come from the layout."""
+        assert self.folder is not None  # noqa: S101  # checked by the caller
+        if not self._rows:
+            for name, (*shape, dtype) in written["shapes"].items():
+                self._rows[name] = Rows(self.folder / f"{name}.bin", tuple(shape), dtype)
+        needed = max((p.stop for p in self._places), default=0)
+        for name, rows in self._rows.items():
+            path = self.folder / f"{name}.bin"
+            held = path.stat().st_size if path.is_file() else 0
+            if held < needed * rows.row_bytes:
+                raise DataError(f"{path} holds {held} bytes, expected {needed * rows.row_bytes}; it was cut off.")
+            rows.reserve(max(needed, self._reserved))
+        self._reserved = max(needed, self._reserved)

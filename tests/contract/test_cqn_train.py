@@ -117,19 +117,6 @@ def test_imitation_only_then_online_from_its_policy(click: list[str], tmp_path: 
 # -- interruptions -----------------------------------------------------------------------------------------------
 
 
-def test_killed_and_resumed_equals_uninterrupted(straight: Path, click: list[str], tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    process = start(*TINY_RUN, *click, f"--output_dir={run}")
-    last = run / "checkpoints" / "last"
-    wait_for(lambda: last.exists() and int(last.resolve().name) >= 10, process)
-    process.kill()
-    process.communicate()
-    done = int(last.resolve().name)
-    assert done < 60, "it was over before it could be killed"
-    assert main(["--resume=true", f"--output_dir={run}"]) == 0
-    assert_same_run(straight, run)
-
-
 def test_ctrl_c_saves_and_says_how_to_continue(click: list[str], tmp_path: Path) -> None:
     run = tmp_path / "run"
     process = start(*TINY_RUN, *click, "--steps=1000000", f"--output_dir={run}")

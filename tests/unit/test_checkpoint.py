@@ -67,7 +67,7 @@ def saver(folder: Path, parts: tuple[Agent, Learner, Replay]) -> Callable[[int],
     def write(steps: int) -> Path:
         learner.update(replay.sample(4, 4, rng))
         counters = Counters(env_steps=steps, episodes=1, updates=1)
-        return save(folder, agent, learner, replay, rng, counters, first_online=1, tables={"updates": 0}, run_config={})
+        return save(folder, agent, learner, rng, counters, tables={"updates": 0}, run_config={})
 
     return write
 
@@ -76,9 +76,8 @@ def assert_whole(folder: Path, parts: tuple[Agent, Learner, Replay]) -> None:
     checkpoint = last_checkpoint(folder)
     agent, _, _ = parts
     policy = CQNPolicy.from_pretrained(checkpoint / "pretrained_model", config=agent.policy.config)
-    replay = Replay(1, 3, 0.9)
-    restore(checkpoint, Learner(policy.model), replay, np.random.default_rng())
-    assert replay.episodes == 1
+    counters, _ = restore(checkpoint, Learner(policy.model), np.random.default_rng())
+    assert counters.episodes == 1
 
 
 @pytest.mark.parametrize("steps", [10, 20], ids=["same step again", "next step"])
@@ -115,14 +114,13 @@ def test_what_is_restored(tmp_path: Path, parts: tuple[Agent, Learner, Replay]) 
     for _ in range(3):
         learner.update(replay.sample(4, 4, rng))
     counters = Counters(env_steps=8, episodes=2, updates=3, offline_done=True, wall_s=1.5)
-    save(tmp_path, agent, learner, replay, rng, counters, first_online=1, tables={"updates": 12}, run_config={})
+    save(tmp_path, agent, learner, rng, counters, tables={"updates": 12}, run_config={})
     expected_draws, expected_torch = rng.random(3), torch.rand(3)
     weights = load_file(last_checkpoint(tmp_path) / "pretrained_model" / "model.safetensors")
     policy = CQNPolicy.from_pretrained(last_checkpoint(tmp_path) / "pretrained_model", config=agent.policy.config)
     assert all(torch.equal(weights[key], value) for key, value in policy.state_dict().items() if key in weights)
     fresh, again = Learner(policy.model), np.random.default_rng(0)
-    empty = Replay(1, 3, 0.9)
-    assert restore(last_checkpoint(tmp_path), fresh, empty, again) == (counters, {"updates": 12})
+    assert restore(last_checkpoint(tmp_path), fresh, again) == (counters, {"updates": 12})
     np.testing.assert_array_equal(again.random(3), expected_draws)
     assert torch.equal(torch.rand(3), expected_torch)
     # The same batch now makes the same update in both: the optimiser is where it was.

@@ -1,7 +1,5 @@
 """The replay against a loop that takes one step after the other."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -145,45 +143,13 @@ def test_the_same_generator_draws_the_same_batch() -> None:
     assert torch.equal(one.reward, other.reward)
 
 
-@pytest.mark.parametrize("first", [0, 1, 3])
-def test_what_is_saved_comes_back(first: int, tmp_path: Path) -> None:
-    episodes = [make_episode(i, length, terminated=i != 1, views=2) for i, length in enumerate((3, 1, 1200, 2))]
-    original, copy = Replay(2, 3, GAMMA), Replay(2, 3, GAMMA)
-    for number, episode in enumerate(episodes):
-        original.add(episode, demo=number != 2)
-        if number < first:
-            copy.add(episode, demo=number != 2)
-    original.save(tmp_path / "episodes.npz", first)
-    copy.load(tmp_path / "episodes.npz")
-    assert (copy.episodes, copy.steps) == (original.episodes, original.steps)
-    assert copy.demonstrations == original.demonstrations
-    a, b = (replay.sample(40, 40, np.random.default_rng(0)) for replay in (original, copy))
-    for name in ("action", "reward", "discount", "demo"):
-        assert torch.equal(getattr(a, name), getattr(b, name))
-    for one, other in ((a.observation, b.observation), (a.next_observation, b.next_observation)):
-        assert torch.equal(one.low_dim, other.low_dim)  # type: ignore[arg-type]
-        assert all(torch.equal(x, y) for x, y in zip(one.pixels, other.pixels, strict=True))
-
-
-def test_nothing_new_is_saved_as_nothing(tmp_path: Path) -> None:
-    original, copy = Replay(1, 1, GAMMA), Replay(1, 1, GAMMA)
-    original.add(make_episode(0, 3), demo=True)
-    original.save(tmp_path / "episodes.npz", 1)
-    copy.load(tmp_path / "episodes.npz")
-    assert copy.episodes == 0
-
-
-def test_pixels_without_state(tmp_path: Path) -> None:
+def test_pixels_without_state() -> None:
     filmed = make_episode(0, 4, views=1)
-    blind = Episode(None, filmed.pixels, filmed.action, filmed.reward, True, True)
-    replay, copy = Replay(2, 1, GAMMA), Replay(2, 1, GAMMA)
-    replay.add(blind, demo=True)
-    replay.save(tmp_path / "episodes.npz")
-    copy.load(tmp_path / "episodes.npz")
-    for stored in (replay, copy):
-        batch = stored.sample(4, 0, np.random.default_rng(0))
-        assert batch.observation.low_dim is None
-        assert batch.observation.pixels[0].shape == (4, 6, SIDE, SIDE)
+    replay = Replay(2, 1, GAMMA)
+    replay.add(Episode(None, filmed.pixels, filmed.action, filmed.reward, True, True), demo=True)
+    batch = replay.sample(4, 0, np.random.default_rng(0))
+    assert batch.observation.low_dim is None
+    assert batch.observation.pixels[0].shape == (4, 6, SIDE, SIDE)
 
 
 def test_growing_keeps_what_was_there() -> None:
