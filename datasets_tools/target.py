@@ -32,6 +32,7 @@ __all__ = [
 ]
 
 HISTORY = Path("meta") / "cqn_history.json"
+ENCODER_THREADS = 2  # for each camera; the encoder's memory grows with them, up to gigabytes on many cores
 CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
 
 
@@ -161,6 +162,7 @@ def new_dataset(
                 image_writer_threads=2 if cameras else 0,
                 rgb_encoder=encoder,
                 streaming_encoding=True,
+                encoder_threads=ENCODER_THREADS,
             )
             yield Target(dataset, folder)
             dataset.finalize()

@@ -8,11 +8,13 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Self
 
 import draccus
+import numpy as np
 import torch
 from datasets import disable_progress_bars
 from lerobot.configs import parser
@@ -35,9 +37,10 @@ from .config import RunConfig
 from .console import ConsoleMonitor
 from .demonstrations import load_episodes, load_metadata
 from .gym_env import GymEnvironment
+from .look import draw_batch, warnings_about
 from .metrics import Metrics, start_wandb
 from .online import Interrupted, Trainer
-from .replay import Replay
+from .replay import Episode, Replay
 
 __all__ = ["main"]
 
@@ -63,14 +66,23 @@ def build(config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], 
         s.frame_stack, s.n_step, s.discount, folder=config.output_dir / "replay",
         capacity_gib=config.replay.capacity_gib, by_step=config.replay.sampling == "steps",
     )  # fmt: skip
+    demonstrations: list[Episode] = []
     with _nothing_left(None if config.resume else config.output_dir):
         if config.dataset.repo_id:
             monitor.phase("load", 1, 0)
             for episode in load_episodes(config.dataset, agent, lambda i, n: monitor.advance(i, f"episode {i}/{n}")):
                 replay.add_demonstration(episode)
+                demonstrations.append(replace(episode, pixels=()))
+        for sentence in warnings_about(demonstrations):
+            monitor.message(f"Warning: {sentence}")
         finished = replay.reopen() if checkpoint is not None else []
     config.output_dir.mkdir(parents=True, exist_ok=True)
     run_config = draccus.encode(config)
+    if checkpoint is None and replay.episodes:
+        picture = config.output_dir / "first_batch.png"
+        sizes = (min(4, config.schedule["batch_size"]), 4 if replay.demonstrations else 0)
+        draw_batch(replay.sample(*sizes, np.random.default_rng(config.seed)), picture)
+        monitor.message(f"First batch: {picture}")
     wandb = None
     if config.wandb.enable:
         wandb = _start_wandb(config, run_config)

@@ -39,6 +39,7 @@ class EvalSettings:
     freq: int = 1000  # environment steps between evaluations; 0: only after the offline phase and at the end
     n_episodes: int = 20  # of each evaluation on the way
     final_n_episodes: int = 50  # after the offline phase and at the end
+    videos: int = 0  # films of the first episodes of each evaluation, in output_dir/videos
 
 
 @dataclass
@@ -106,6 +107,8 @@ class RunConfig:
                 raise ConfigError(f"`{name}` must be at least {least}, got {value}.")
         if self.eval.final_n_episodes < 1 or self.eval.n_episodes < 1:
             raise ConfigError("`eval.n_episodes` and `eval.final_n_episodes` must be at least 1.")
+        if self.eval.videos < 0:
+            raise ConfigError(f"`eval.videos` must be at least 0, got {self.eval.videos}.")
         if not 0 < self.replay.capacity_gib < float("inf"):
             raise ConfigError(f"`replay.capacity_gib` must be positive and finite, got {self.replay.capacity_gib}.")
         if self.replay.sampling not in (valid := ("episodes", "steps")):

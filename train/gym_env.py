@@ -32,12 +32,18 @@ class GymEnvironment:
             raise DataError(f"Expected one task, '{config.type}' made {len(vectors)}: name one with `--env.task=`.")
         self._vector = vectors[0]
         self.env: gym.Env[Any, Any] = self._vector.envs[0]
+        self._fps = int(config.fps)
         self._pre, self._post = make_env_pre_post_processors(config, policy_config)
 
     @property
     def max_steps(self) -> int:
         """Control steps before an episode is cut off."""
         return int(self.env.get_wrapper_attr("_max_episode_steps"))
+
+    @property
+    def fps(self) -> int:
+        """Control steps a second, as LeRobot's environment config says."""
+        return self._fps
 
     def reset(self, seed: int) -> Frame:
         """Start an episode that `seed` determines."""

@@ -34,6 +34,11 @@ class Environment(Protocol):
         """Control steps before an episode is cut off."""
         ...
 
+    @property
+    def fps(self) -> int:
+        """Control steps a second."""
+        ...
+
     def reset(self, seed: int) -> Frame:
         """Start an episode that `seed` determines."""
         ...

@@ -4,22 +4,26 @@ import contextlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from lerobot_cqn.learner import Learner
+from lerobot_cqn.learner import Learner, NonFiniteLossError
+from lerobot_cqn.schema import Batch
 
 from .agent import Agent, Recorder
 from .checkpoint import Counters
 from .config import RunConfig
 from .evaluate import Evaluation, evaluate
 from .interfaces import Environment
+from .look import save_batch, write_films
 from .metrics import Metrics
 from .replay import Replay
 from .storage import Place
 
 __all__ = ["Interrupted", "Monitor", "Trainer"]
+
+RECENT = 20  # training episodes in the progress line
 
 
 class Interrupted(Exception):  # noqa: N818  # a request, not an error
@@ -59,6 +63,7 @@ class Trainer:
     should_stop: Callable[[], bool]
     evaluations: list[tuple[str, Evaluation]] = field(default_factory=list)
     finished_since: Sequence[Place] = ()
+    _recent: list[bool] = field(default_factory=list)
     _clock: float = field(default_factory=time.monotonic)
 
     def run(self) -> None:
@@ -126,14 +131,16 @@ class Trainer:
         self.replay.add(episode, demo=demo, number=c.episodes, note=row)
         c.episodes += 1
         self.metrics.write("episodes", row)
-        self.monitor.advance(c.env_steps, f"episode {c.episodes}  Q {row['mean_q']:+.2f}")
+        self._recent = [*self._recent, outcome.success][-RECENT:]
+        lately = f"success {sum(self._recent)}/{len(self._recent)} lately"
+        self.monitor.advance(c.env_steps, f"episode {c.episodes}  {lately}  Q {row['mean_q']:+.2f}")
 
     def updates(self, count: int, on_update: Callable[[], None] = lambda: None) -> None:
         """Gradient updates on batches from both stores, the next one put together meanwhile."""
         sizes = self.config.schedule["batch_size"], self.config.schedule["demo_batch_size"]
         with contextlib.closing(self.replay.batches(count, *sizes, self.rng)) as batches:
             for batch in batches:
-                stats = self.learner.update(batch)
+                stats = self._update(batch)
                 self.counters.updates += 1
                 if self.counters.updates % self.config.log_freq == 0:
                     losses = {name: float(value) for name, value in stats.items()}
@@ -141,6 +148,14 @@ class Trainer:
                 on_update()
                 if self.should_stop():
                     raise Interrupted
+
+    def _update(self, batch: Batch) -> dict[str, Any]:
+        try:
+            return self.learner.update(batch)
+        except NonFiniteLossError as error:
+            path = self.metrics.output_dir / "bad_batch.pt"
+            save_batch(batch, path)
+            raise NonFiniteLossError(f"{error} The batch is in {path}.") from error
 
     def take_up(self, places: Sequence[Place]) -> None:
         """Episodes that were finished after the last checkpoint: they count, and their updates are made again."""
@@ -160,7 +175,11 @@ class Trainer:
             if self.should_stop():
                 raise Interrupted
 
-        result = evaluate(self.agent, self.env, episodes, on_episode=look)
+        films = self.config.eval.videos
+        result = evaluate(self.agent, self.env, episodes, on_episode=look, film=films)
+        if films:
+            stem = f"{phase}_{self.counters.env_steps:06d}"
+            write_films(result.frames, result.outcomes, self.metrics.output_dir / "videos", stem, self.env.fps)
         self.evaluations.append((phase, result))
         low, high = result.interval
         row = {

@@ -19,6 +19,7 @@ from safetensors.torch import load_file
 
 from cqn_train.cli import StopRequest, main
 from cqn_train.metrics import COLUMNS
+from lerobot_cqn.critic import CQNModel
 from lerobot_cqn.modeling_cqn import CQNPolicy
 
 from ..toy_datasets import make_dataset
@@ -115,6 +116,34 @@ def test_imitation_only_then_online_from_its_policy(click: list[str], tmp_path: 
 
 
 # -- interruptions -----------------------------------------------------------------------------------------------
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_batch(
+    click: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    original, calls = CQNModel.loss, iter(range(1000))
+
+    def loss(self: CQNModel, batch: Any) -> Any:
+        value, stats = original(self, batch)
+        return value * (float("nan") if next(calls) == 25 else 1.0), stats
+
+    monkeypatch.setattr(CQNModel, "loss", loss)
+    assert main([*TINY_RUN, *click, f"--output_dir={run}"]) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "The loss is nan" in said
+    assert str(run / "bad_batch.pt") in said
+    assert torch.load(run / "bad_batch.pt", weights_only=True)["action"].shape == (8, 7)
+    monkeypatch.undo()
+    assert main(["--resume=true", f"--output_dir={run}", "--steps=20"]) == 0
+
+
+def test_films_of_evaluations(click: list[str], tmp_path: Path) -> None:
+    flags = ["--steps=0", "--offline_updates=1", "--eval.videos=1", f"--output_dir={tmp_path / 'run'}"]
+    assert main([*TINY_RUN, *click, *flags]) == 0
+    (film,) = (tmp_path / "run" / "videos").iterdir()
+    assert film.name in ("final_000000_0_failure.mp4", "final_000000_0_success.mp4")
+    assert (tmp_path / "run" / "first_batch.png").stat().st_size > 1000
 
 
 def test_ctrl_c_saves_and_says_how_to_continue(click: list[str], tmp_path: Path) -> None:
