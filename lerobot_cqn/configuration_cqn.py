@@ -60,6 +60,7 @@ class CQNConfig(PreTrainedConfig):
     bc_margin: float | None = None
     discount: float | None = None
     n_step: int | None = None
+    centralized_critic: bool | None = None
     next_action_from: str | None = None
     # Optimisation
     lr: float | None = None

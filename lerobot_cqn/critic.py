@@ -10,7 +10,15 @@ from torch import Tensor, nn
 from .augmentation import colour_jitter, random_shift
 from .distributional import expectation, project, support
 from .intervals import decode, encode, previous_centres, zoom
-from .losses import demo_mean, dominance_loss, margin_loss, q_learning_loss, scalar_q_learning_loss, take_bin
+from .losses import (
+    demo_mean,
+    dominance_loss,
+    margin_loss,
+    mean_log_probs,
+    q_learning_loss,
+    scalar_q_learning_loss,
+    take_bin,
+)
 from .networks import CoarseToFineNetwork, Projected, ViewEncoder, initialise, zero_head
 from .schema import Batch, Observation
 from .settings import CQNSettings
@@ -174,6 +182,9 @@ class CQNModel(nn.Module):
             with torch.no_grad():
                 target = self.td_target(self.encode(batch.next_observation), batch.reward, batch.discount)
             taken = take_bin(logits, indices)[..., 0, :]
+            if s.centralized_critic:
+                taken = mean_log_probs(taken) if s.distributional else taken.mean(2, keepdim=True)
+                target = target.mean(2, keepdim=True)
             if s.distributional:
                 rl = q_learning_loss(taken, target).mean()
             else:

@@ -3,13 +3,22 @@
 All take the predictions of every level and dimension at once and average over L and D as Algorithm 2 does.
 """
 
+import math
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-__all__ = ["demo_mean", "dominance_loss", "margin_loss", "q_learning_loss", "scalar_q_learning_loss", "take_bin"]
+__all__ = [
+    "demo_mean",
+    "dominance_loss",
+    "margin_loss",
+    "mean_log_probs",
+    "q_learning_loss",
+    "scalar_q_learning_loss",
+    "take_bin",
+]
 
 
 def q_learning_loss(logits_taken: Tensor, target: Tensor) -> Tensor:
@@ -23,6 +32,15 @@ def q_learning_loss(logits_taken: Tensor, target: Tensor) -> Tensor:
 def scalar_q_learning_loss(q_taken: Tensor, target: Tensor) -> Tensor:
     """Squared temporal-difference error (equation 2 as written); q_taken, target: [B, L, D]. Returns [B]."""
     return (q_taken - target).square().mean((1, 2))
+
+
+def mean_log_probs(logits: Tensor) -> Tensor:
+    """Logarithm of the mean over D of the distributions: [B, L, D, A] -> [B, L, 1, A].
+
+    A centralised critic values an action as a whole by the mean over its dimensions (Seyde et al. 2023; one of the
+    paper's ablations).
+    """
+    return F.log_softmax(logits, dim=-1).logsumexp(2, keepdim=True) - math.log(logits.shape[2])
 
 
 def dominance_loss(probs: Tensor, expert: Tensor) -> Tensor:

@@ -41,6 +41,7 @@ class CQNSettings:
     bc_margin: float = 0.01  # the authors' implementation; the paper gives no number
     discount: float = 0.99  # the authors' implementation; the paper gives no number
     n_step: int = 3
+    centralized_critic: bool = False  # True: one value for the whole action, the mean over D (an ablation of the paper)
     next_action_from: str = "online"  # the authors' double-Q style; "target" is equation 2 as written
     # Optimisation
     lr: float = 5e-5

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from lerobot_cqn.critic import CQNModel
-from lerobot_cqn.intervals import snap
+from lerobot_cqn.intervals import encode, snap
 from lerobot_cqn.learner import Learner, NonFiniteLossError
-from lerobot_cqn.losses import margin_loss
+from lerobot_cqn.losses import margin_loss, take_bin
 from lerobot_cqn.schema import Batch, Observation
 from lerobot_cqn.settings import CQNSettings
 
@@ -283,3 +283,26 @@ def test_augmentation_is_part_of_the_update_only() -> None:
     assert not torch.equal(model.augment(observation).pixels[0], observation.pixels[0])
     jittered = build(1, 0, 2, brightness=0.2).augment(observation).pixels[0]
     assert jittered.is_floating_point()
+
+
+@pytest.mark.parametrize("distributional", [True, False])
+def test_centralized_critic_learns_the_mean_over_dimensions(distributional: bool) -> None:
+    """Against the definition, value by value; nothing else of the loss changes."""
+    alone, together = (
+        build(0, P, 3, centralized_critic=central, distributional=distributional, bc_loss_scale=0.0, rl_loss_scale=1.0)
+        for central in (False, True)
+    )
+    together.load_state_dict(alone.state_dict())
+    samples = random_batch(alone, 0, P)
+    with torch.no_grad():
+        path = encode(samples.action, alone.settings.levels, alone.settings.bins)
+        projected = alone.project(alone.critic, alone.encode(samples.observation))
+        taken = take_bin(alone.evaluate(alone.critic, projected, path), path)[..., 0, :]
+        target = alone.td_target(alone.encode(samples.next_observation), samples.reward, samples.discount)
+        if distributional:
+            expected = -(target.mean(2) * taken.softmax(-1).mean(2).log()).sum(-1).mean()
+        else:
+            expected = (taken[..., 0].mean(2) - target.mean(2)).square().mean()
+    torch.testing.assert_close(together.loss(samples)[0], expected)
+    assert not torch.allclose(alone.loss(samples)[0], expected)
+    torch.testing.assert_close(together.act(samples.observation)[0], alone.act(samples.observation)[0])
