@@ -8,7 +8,6 @@ own.
 """
 
 import argparse
-import csv
 import json
 import platform
 import resource
@@ -27,6 +26,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from cqn_data.pictures import shaped, video_pictures
 from cqn_data.view import Camera
+
+from .results_table import append
 
 CAMERAS = [f"observation.images.{name}" for name in ("front", "left", "right", "wrist")]
 JOINTS, FPS = 7, 30
@@ -141,13 +142,7 @@ def main() -> None:
             **parts(source),
         }
     print(json.dumps(row, indent=2))
-    if options.csv:
-        new = not options.csv.exists()
-        with options.csv.open("a", newline="") as file:
-            writer = csv.DictWriter(file, list(row))
-            if new:
-                writer.writeheader()
-            writer.writerow(row)
+    append(options.csv, [row])
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ episodes (4 views of 84x84, stack 8, n 3 by default) and take turns in one proce
 """
 
 import argparse
-import csv
 import statistics
 import tempfile
 import time
@@ -20,6 +19,8 @@ import numpy as np
 import torch
 
 from cqn_train.replay import Episode, Replay
+
+from .results_table import append
 
 GAMMA = 0.99
 
@@ -114,13 +115,7 @@ def main() -> None:
         ]  # fmt: skip
     for row in rows:
         print(row)
-    if o.csv:
-        new = not o.csv.exists()
-        with o.csv.open("a", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
-            if new:
-                writer.writeheader()
-            writer.writerows(rows)
+    append(o.csv, rows)
 
 
 if __name__ == "__main__":

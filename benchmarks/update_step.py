@@ -10,7 +10,6 @@ belong to; `backward` is what remains of an update.
 """
 
 import argparse
-import csv
 import statistics
 import time
 from collections import defaultdict
@@ -26,6 +25,8 @@ from lerobot_cqn.learner import Learner
 from lerobot_cqn.schema import Batch, Observation
 from lerobot_cqn.settings import PRESETS, CQNSettings
 from tests.oracle import Oracle
+
+from .results_table import append
 
 PARTS = ("augment", "encode", "critic", "backward", "optimiser")
 LOW_DIM, DIMS, SIDE = 13, 7, 84
@@ -158,14 +159,7 @@ def main() -> None:
                 f"torch {torch.__version__.split('+')[0]}",
             }
         )  # fmt: skip
-    if args.csv:
-        args.csv.parent.mkdir(parents=True, exist_ok=True)
-        new = not args.csv.exists()
-        with args.csv.open("a", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
-            if new:
-                writer.writeheader()
-            writer.writerows(rows)
+    append(args.csv, rows)
 
 
 if __name__ == "__main__":
