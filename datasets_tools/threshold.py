@@ -34,6 +34,7 @@ LOW, HIGH, PER_DECADE = -10, 6, 40  # of the histogram, in log10
 BINS = (HIGH - LOW) * PER_DECADE
 BRISK = 0.95  # quantile of the motion that stands for brisk motion
 FLOOR = 1e-3  # of brisk motion; whatever is slower counts as not moving
+COARSE = 1 / 3  # of brisk motion; no encoder is coarser
 NO_SIGN = 1e-2  # of brisk motion, at most, where nothing else gives a threshold
 BLUR, BLUR_FEW = 0.06, 0.3  # decades, standard deviation of the smoothing: at least; times steps ** -0.2
 DEEP = 0.15  # of the lower mode's height: a valley below this is clean
@@ -143,6 +144,7 @@ class Motion:
             return self._suggestion(1e-3, nothing, clear=False)
         brisk = _quantile(self._steps[1:], BRISK)
         tick = self._tick(brisk * FLOOR)
+        tick = tick if tick <= COARSE * brisk else 0.0  # a motion at one speed looks like an encoder's step
         floor = max(brisk * FLOOR, 1.25 * tick)
         gap = _gap(self._steps, floor)
         if gap is not None:

@@ -222,3 +222,13 @@ def test_tremor_is_checked(capsys, option, said):
     assert main(["record", "--repo_id=a/b", option]) == 2
     assert said in capsys.readouterr().err
     logging.disable(logging.NOTSET)
+
+
+@pytest.mark.parametrize("episodes", [1, 3, 20])
+def test_motion_at_one_speed_is_no_encoder_step(episodes):
+    """As scripted arms move: steps of one size, and pauses in which nothing moves at all."""
+    speed = np.where((np.arange(40) % 20 < 8), 0.0, 0.1)
+    joints = np.cumsum(speed)[:, None] * np.ones((1, 3))
+    found = suggest([joints] * episodes)
+    assert found.clear
+    assert 0 < found.threshold < 0.09
