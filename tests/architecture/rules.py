@@ -51,7 +51,7 @@ SIBLINGS: dict[str, set[str]] = {
 }
 
 # --- Packages of the extras: imported on use, so that everything else works without them.
-OPTIONAL = frozenset({"mujoco", "matplotlib", "wandb", "fastapi", "uvicorn", "h5py", "zarr"})
+OPTIONAL = frozenset({"mujoco", "matplotlib", "wandb", "fastapi", "uvicorn", "h5py", "zarr", "rliable"})
 # Modules that need one at their top; they in turn are imported only inside functions or by one another.
 IMPORTED_ON_USE = frozenset[str]()
 
