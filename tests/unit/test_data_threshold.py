@@ -95,6 +95,7 @@ def test_whatever_moves_the_answer_is_consistent(moves, unit):
     episodes = [np.cumsum(np.array(m) * unit)[:, None] for m in moves]
     found = suggest(episodes)
     motion = np.concatenate([np.zeros(0), *(np.abs(np.diff(e[:, 0])) for e in episodes)])
+    motion[motion < 1.01e-10] = 0  # slower than the histogram reaches: taken for no motion
     assert found.steps == len(motion)
     assert found.counts.sum() == len(motion)
     assert 0 < found.threshold < np.inf
@@ -131,12 +132,13 @@ def test_a_million_steps_are_cheap():
 # --- The station, whose operator knows when it pauses.
 
 
-def station_episodes(task, share, tremor, seed, count=12):
+def station_episodes(task, share, tremor, seed):
     """(state (T, 7), action (T, 7), pause (T,)) of each successful episode, as `cqn-data record` would keep them."""
     pytest.importorskip("mujoco")
     from cqn_train.envs.station import UR5eStation
 
     env = UR5eStation(task=task)
+    count = max(4, 240 // env.station_task.typical_steps)  # long episodes tell as much in smaller numbers
     operator = env.scripted_teleoperator(pause_share=share, seed=seed, tremor_rad=tremor)
     done = []
     for attempt in range(seed, seed + 4 * count):

@@ -104,6 +104,32 @@ def test_the_scripted_operator_succeeds(make, task, fps):
 
 
 @pytest.mark.parametrize("task", TASK_NAMES)
+def test_success_comes_by_the_operator_and_stays(make, task):
+    env = make(task)
+    station, operator = env.unwrapped, env.unwrapped.scripted_teleoperator()
+    for seed in range(20):
+        env.reset(seed=seed)
+        assert not station.station_task.success(station.arm)
+    play(env, operator, 19)
+    for _ in range(10):  # physics holds it while the arm stands still
+        success = station.step(np.append(np.zeros(6), operator.act()[6]))[2]
+        assert success
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_objects_never_jump(make, task):
+    env = make(task)
+    operator, data = env.unwrapped.scripted_teleoperator(), env.unwrapped.arm.data
+    env.reset(seed=2)
+    operator.reset(2)
+    ended = False
+    while not ended:
+        before = data.xpos.copy()
+        ended = env.step(operator.act())[2]
+        assert np.abs(data.xpos - before).max() < 0.12  # m in a tenth of a second
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
 def test_pauses_take_the_share_asked_for(make, task):
     env = make(task, max_episode_steps=4 * TASKS[task].max_episode_steps)
     operator = env.unwrapped.scripted_teleoperator(pause_share=0.45)
@@ -145,6 +171,34 @@ def test_a_button_pushed_by_anything_else_is_no_success(make):
     station.arm.data.joint("plunger").qpos[0] = 0.015
     station.arm.forward()
     assert not station.station_task.success(station.arm)
+
+
+def test_the_glass_still_stands_when_let_go(make):
+    env = make("flip_cup")
+    station, operator = env.unwrapped, env.unwrapped.scripted_teleoperator()
+    for seed in range(4):
+        play(env, operator, seed)
+        for lift in [0.0] * 5 + [-0.03] * 10:
+            success = station.step(np.array([0, lift, 0, 0, 0, 0, 0]))[2]
+        assert success
+
+
+def test_a_lid_that_is_let_go_falls_back(make):
+    env = make("take_lid_off_saucepan")
+    play(env, env.unwrapped.scripted_teleoperator(), 0)
+    for _ in range(5):
+        success = env.unwrapped.step(np.zeros(7))[2]
+    assert not success
+
+
+def test_a_teddy_counts_only_in_the_open_drawer(make):
+    station = make("open_drawer_put_teddy").unwrapped
+    station.reset(seed=0)
+    for opening, x, expected in [(0.18, 0.55, True), (0.10, 0.62, False), (0.18, 0.40, False)]:
+        station.arm.data.joint("drawer").qpos[0] = opening
+        station.arm.data.joint("teddy").qpos[:3] = x, 0.15, 0.03
+        station.arm.forward()
+        assert station.station_task.success(station.arm) is expected
 
 
 def test_deltas_are_clipped_and_tracked(make):
@@ -211,6 +265,23 @@ def test_the_button_is_seen_wherever_it_stands(make):
         for name, picture in env.reset(seed=seed)[0]["pixels"].items():
             red = (picture[..., 0] > 150) & (picture[..., 1] < 80) & (picture[..., 2] < 80)
             assert red.sum() >= 6, (seed, name)
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_the_objects_are_seen_wherever_they_stand(make, task):
+    env = make(task, obs_type="pixels")
+    model = env.unwrapped.arm.model
+    fixed = [0, model.body("base").id]  # the world and the arm
+    objects = [geom for geom in range(model.ngeom) if model.body_rootid[model.geom_bodyid[geom]] not in fixed]
+    for seed in range(8):
+        seen = env.reset(seed=seed)[0]["pixels"]
+        colours = model.geom_rgba[objects]
+        model.geom_rgba[objects, 3] = 0.0
+        bare = env.unwrapped._observe()["pixels"]
+        model.geom_rgba[objects] = colours
+        for name, picture in seen.items():
+            changed = np.abs(picture.astype(int) - bare[name]).max(axis=-1) > 30
+            assert changed.sum() >= 25, (seed, name)
 
 
 def test_state_mode_opens_no_graphics(make, monkeypatch):

@@ -82,7 +82,7 @@ class ClickButton(Task):
             # The fingers close on the way in; far away they stay open.
             closure=1.0 if aside < 0.12 else 0.0,
             speed=0.08 + 0.07 * near,
-            hesitate=aside < 0.03,
+            hesitate=int(aside < 0.03),
         )
 
 

@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.errors import ConfigError
 
+from .task import Goal
+
 if TYPE_CHECKING:
     from .station import UR5eStation
 
@@ -25,7 +27,7 @@ class ScriptedTeleoperator:
     """Proportional steering towards the task's goal by damped least squares, with human-like pauses.
 
     While moving, the action depends on the present state alone. While pausing it is a zero delta with the
-    gripper as it was. Pauses come at the start, at the task's natural moment, and at random.
+    gripper as it was. Pauses come at the start, at the task's natural moments, and at random.
 
     Attributes:
         pausing: whether the last `act` was a pause: no steering, only the tremor if there is one.
@@ -52,9 +54,9 @@ class ScriptedTeleoperator:
         self._env = env
         self._tremor = tremor_rad
         still_per_move = pause_share / (1.0 - pause_share)
-        self._natural = min(1.0, still_per_move)  # probability of a pause at the start, and before committing
+        self._natural = min(1.0, still_per_move)  # probability of a pause at each natural moment, the start included
         moves = env.station_task.typical_steps * env.fps / 10
-        expected = 2 * self._natural * _MEAN_PAUSE / moves
+        expected = (1 + env.station_task.natural_pauses) * self._natural * _MEAN_PAUSE / moves
         self._hazard = float(np.clip((still_per_move - expected) / _MEAN_PAUSE, 0.0, 1.0))
         self.reset(seed)
 
@@ -63,7 +65,7 @@ class ScriptedTeleoperator:
         self._rng = np.random.default_rng(seed)
         self._closure = self._env.arm.closure
         self._left = self._pause() if self._rng.random() < self._natural else 0
-        self._hesitated = False
+        self._hesitated = 0
         self.pausing = False
 
     def act(self) -> NDArray[np.float32]:
@@ -71,8 +73,8 @@ class ScriptedTeleoperator:
         delta: NDArray[np.float64] = np.zeros(6)
         goal = self._env.station_task.goal(self._env.arm)
         if self._left == 0:
-            if goal.hesitate and not self._hesitated:
-                self._hesitated = True
+            if goal.hesitate > self._hesitated:
+                self._hesitated = goal.hesitate
                 self._left = self._pause() if self._rng.random() < self._natural else 0
             elif self._rng.random() < self._hazard:
                 self._left = self._pause()
@@ -80,7 +82,7 @@ class ScriptedTeleoperator:
         if self.pausing:
             self._left -= 1
         else:
-            delta = self._steer(goal.tip, goal.yaw, goal.speed)
+            delta = self._steer(goal)
             self._closure = goal.closure
         if self._tremor > 0.0:
             delta = delta + self._rng.normal(0.0, self._tremor, 6)
@@ -90,14 +92,16 @@ class ScriptedTeleoperator:
     def _pause(self) -> int:
         return int(self._rng.integers(_PAUSE_STEPS[0], _PAUSE_STEPS[1] + 1))
 
-    def _steer(self, target: NDArray[np.float64], yaw: float, speed: float) -> NDArray[np.float64]:
-        """Joint deltas, (6,) rad, for one step towards `target` (3,) m at no more than `speed` m/s."""
+    def _steer(self, goal: Goal) -> NDArray[np.float64]:
+        """Joint deltas, (6,) rad, for one step towards the goal at no more than its speed."""
         arm = self._env.arm
-        move = (target - arm.tip) * min(_GAIN / self._env.fps, 1.0)
-        cap = speed / self._env.fps
+        move = (goal.tip - arm.tip) * min(_GAIN / self._env.fps, 1.0)
+        cap = goal.speed / self._env.fps
         move *= min(1.0, cap / (float(np.linalg.norm(move)) + 1e-9))
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        wanted = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ _DOWN
+        cos, sin = np.cos(goal.yaw), np.sin(goal.yaw)
+        wanted = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        cos, sin = np.cos(goal.pitch), np.sin(goal.pitch)
+        wanted = wanted @ np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]]) @ _DOWN
         # Half the sum of the axes' cross products is the rotation vector for small angles.
         turn = 0.5 * np.cross(arm.tip_rotation.T, wanted.T).sum(axis=0) * min(_TURN_GAIN / self._env.fps, 1.0)
         jacobian = arm.jacobian()

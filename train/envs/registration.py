@@ -37,10 +37,11 @@ class UR5eStationEnv(EnvConfig):
     """A simulated UR5e station: four cameras, delta joint actions, sparse reward.
 
     Attributes:
-        task: click_button.
+        task: click_button, flip_cup, open_drawer_put_teddy or take_lid_off_saucepan.
         fps: control steps a second: 5, 10, 20, 25 or 50.
-        episode_length: control steps before the episode is cut off; None: the task's own (100 at 10 Hz for
-            click_button), scaled with fps.
+        episode_length: control steps before the episode is cut off; None: the task's own (at 10 Hz: 100 for
+            click_button, 250 for flip_cup, 400 for open_drawer_put_teddy, 120 for take_lid_off_saucepan), scaled
+            with fps.
         obs_type: "state" (joints and the objects' simulator state), "pixels" (joints and cameras) or "both".
         cameras: which of left_shoulder, right_shoulder, upper_wrist, lower_wrist; unused with "state".
         image_size: height and width of each camera's picture, 16 to 1024 pixels.

@@ -21,14 +21,17 @@ class Goal:
         closure: gripper command, 0 (open) to 1 (closed).
         speed: cap on the fingertip's speed, m/s.
         yaw: direction of the finger-to-finger axis about the vertical, rad; 0 is along the world's y.
-        hesitate: a natural moment to pause (an operator checks before committing).
+        pitch: turn of the tool about the finger-to-finger axis, rad; 0 points down, pi / 2 back along -x.
+        hesitate: number of the natural moment to pause that is reached (an operator checks before committing),
+            1 to the task's `natural_pauses`; 0 is none.
     """
 
     tip: NDArray[np.float64]
     closure: float
     speed: float
     yaw: float = 0.0
-    hesitate: bool = False
+    pitch: float = 0.0
+    hesitate: int = 0
 
 
 class Task:
@@ -43,6 +46,7 @@ class Task:
     typical_steps: ClassVar[int]  # steps the scripted teleoperator needs without pauses
     state_names: ClassVar[tuple[str, ...]]  # of `state`, one name a value
     start_closure: ClassVar[float] = 0.0
+    natural_pauses: ClassVar[int] = 1  # moments that `Goal.hesitate` numbers
 
     def mjcf(self) -> str:
         """Objects of the task, as top-level MJCF sections."""
