@@ -118,9 +118,14 @@ def new_folder(root: Path) -> Iterator[Path]:
         OutputExistsError: something is at ``root`` already, at the start or by the end.
     """
     refuse_existing(root)
-    root.parent.mkdir(parents=True, exist_ok=True)
-    _sweep(root)
     folder = root.parent / f".{root.name}.{os.getpid()}.tmp"
+    try:
+        root.parent.mkdir(parents=True, exist_ok=True)
+        _sweep(root)
+        folder.mkdir()  # whether one may write there at all; whoever fills it expects to make it
+        folder.rmdir()
+    except OSError as error:
+        raise OutputError(f"Nothing can be written to {root.parent}: {error}") from error
     try:
         yield folder
         refuse_existing(root)

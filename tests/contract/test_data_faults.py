@@ -144,6 +144,15 @@ def test_a_disk_that_takes_no_more_is_named_in_one_line(recording, tmp_path):
     assert not list(tmp_path.glob(".dst.*"))
 
 
+def test_a_place_that_cannot_be_written_to_is_named(recording, tmp_path, capsys):
+    (tmp_path / "file").write_text("mine")
+    for target in ("/proc/nowhere/dst", str(tmp_path / "file" / "dst")):
+        names = ["--repo_id=local/src", f"--root={recording}", f"--new_root={target}", "--size=[32,32]"]
+        assert main(["resize", *names]) == 2
+        assert "Nothing can be written to" in capsys.readouterr().err
+    assert (tmp_path / "file").read_text() == "mine"
+
+
 def test_two_runs_for_one_place_do_not_mix(recording, tmp_path):
     target = tmp_path / "dst"
     processes = [start(recording, target), start(recording, target)]
