@@ -117,7 +117,7 @@ def _draw_aggregate(iqm: Aggregate, seeds: int, tasks: int, path: Path) -> None:
         axis.plot([estimate, estimate], [row - 0.28, row + 0.28], color=COLOURS[row % len(COLOURS)], linewidth=2.5)
     axis.set_yticks(range(len(iqm)), list(iqm))
     axis.set(
-        xlim=(-0.02, 1.02), xlabel=f"success rate, interquartile mean and 95 % interval ({seeds} seeds, {tasks} tasks)"
+        xlim=(-0.02, 1.02), xlabel=f"success rate, interquartile mean and 95 % interval ({seeds} seeds, {tasks} task{"s" * (tasks > 1)})"
     )
     axis.invert_yaxis()
     axis.spines[["top", "right"]].set_visible(False)
