@@ -116,9 +116,8 @@ def _draw_aggregate(iqm: Aggregate, seeds: int, tasks: int, path: Path) -> None:
         axis.barh(row, high - low, left=low, height=0.55, color=COLOURS[row % len(COLOURS)], alpha=0.35)
         axis.plot([estimate, estimate], [row - 0.28, row + 0.28], color=COLOURS[row % len(COLOURS)], linewidth=2.5)
     axis.set_yticks(range(len(iqm)), list(iqm))
-    axis.set(
-        xlim=(-0.02, 1.02), xlabel=f"success rate, interquartile mean and 95 % interval ({seeds} seeds, {tasks} task{"s" * (tasks > 1)})"
-    )
+    counts = f"{seeds} seeds, {tasks} task{'s' * (tasks > 1)}"
+    axis.set(xlim=(-0.02, 1.02), xlabel=f"success rate, interquartile mean and 95 % interval ({counts})")
     axis.invert_yaxis()
     axis.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=130)
