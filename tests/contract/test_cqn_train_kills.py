@@ -1,22 +1,20 @@
 """`kill -9` at any moment of online training: what `--resume` finds and how it goes on."""
 
-import itertools
 import os
 import random
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from cqn_train import checkpoint, cli
 from cqn_train.cli import main
 from cqn_train.storage import Journal, Place
 
 from .conftest import TINY_RUN
 from .test_cqn_train import assert_same_run, tables
+from .zygote import Zygote, zygote
 
 
 def wait_until(ready: Callable[[], bool]) -> None:
@@ -26,41 +24,26 @@ def wait_until(ready: Callable[[], bool]) -> None:
         time.sleep(0.003)
 
 
-def fork(*arguments: str, dies_after_save: int = 0) -> int:
-    """Run in a copy of this process, which has everything imported; returns its number."""
-    number = os.fork()
-    if number == 0:
-        code = 1
-        try:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-            os.dup2(1, 2)
-            saved = itertools.count(1)
-
-            def save_and_die(*args: Any, **kwargs: Any) -> Path:
-                written = checkpoint.save(*args, **kwargs)
-                if next(saved) == dies_after_save:
-                    os.kill(os.getpid(), signal.SIGKILL)
-                return written
-
-            cli.save = save_and_die
-            code = main(list(arguments))
-        finally:
-            os._exit(code)
-    return number
+@pytest.fixture(scope="module")
+def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Zygote]:
+    with zygote("cqn_train.cli", tmp_path_factory.mktemp("zygote") / "log") as started:
+        yield started
 
 
 @pytest.mark.parametrize("saves", [1, 2, 4])
 def test_killed_at_a_checkpoint_and_resumed_equals_uninterrupted(
-    straight: Path, click: list[str], tmp_path: Path, saves: int
+    straight: Path, click: list[str], tmp_path: Path, saves: int, processes: Zygote
 ) -> None:
     run = tmp_path / "run"
-    process = fork(*TINY_RUN, *click, f"--output_dir={run}", dies_after_save=saves)
-    assert os.WTERMSIG(os.waitpid(process, 0)[1]) == signal.SIGKILL
+    process = processes.start(*TINY_RUN, *click, f"--output_dir={run}", dies_after_save=saves)
+    assert os.WTERMSIG(processes.wait(process)) == signal.SIGKILL
     assert main(["--resume=true", f"--output_dir={run}"]) == 0
     assert_same_run(straight, run)
 
 
-def test_killed_at_twenty_random_moments_it_loses_no_finished_episode(click: list[str], tmp_path: Path) -> None:
+def test_killed_at_twenty_random_moments_it_loses_no_finished_episode(
+    click: list[str], tmp_path: Path, processes: Zygote
+) -> None:
     run, rng = tmp_path / "run", random.Random(0)
     journal = Journal(run / "replay" / "episodes.jsonl")
     steps = "--steps=100000"
@@ -69,15 +52,14 @@ def test_killed_at_twenty_random_moments_it_loses_no_finished_episode(click: lis
         journal.repair()
         return [place for _, place in journal.entries() if place is not None]
 
-    process = fork(*TINY_RUN, *click, steps, "--save_freq=70", "--eval.freq=0", f"--output_dir={run}")
+    process = processes.start(*TINY_RUN, *click, steps, "--save_freq=70", "--eval.freq=0", f"--output_dir={run}")
     wait_until((run / "checkpoints" / "last").exists)
     before = 0
     for kill in range(20):
         here = len(finished())
         wait_until(lambda here=here: len(finished()) > here)
         time.sleep(rng.uniform(0, 0.15))
-        os.kill(process, signal.SIGKILL)
-        os.waitpid(process, 0)
+        processes.kill(process)
         places = finished()
         assert [p.number for p in places] == list(range(len(places)))
         assert len(places) > before
@@ -85,7 +67,7 @@ def test_killed_at_twenty_random_moments_it_loses_no_finished_episode(click: lis
         rows = [int(row["episode"]) for row in tables(run)["episodes"]]
         assert rows == list(range(len(rows)))
         if kill < 19:
-            process = fork("--resume=true", f"--output_dir={run}")
+            process = processes.start("--resume=true", f"--output_dir={run}")
     total = sum(place.length for place in finished())
     assert main(["--resume=true", f"--output_dir={run}", f"--steps={total}"]) == 0
     episodes = tables(run)["episodes"]

@@ -16,6 +16,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from cqn_data.cli import main
 
+from .zygote import zygote
+
 CODE = "import sys; from cqn_data.cli import main; sys.exit(main(sys.argv[1:]))"
 SIDE, LENGTHS = 64, (40, 40, 40)
 # Shares of the time that an undisturbed run takes, at which the process is killed.
@@ -52,19 +54,9 @@ def start(source, target, *options, **more):
     return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **more)
 
 
-def fork(source, target):
-    """The same in a copy of this process, which has everything imported already; returns its number."""
-    number = os.fork()
-    if number == 0:
-        code = 1
-        try:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-            os.dup2(1, 2)
-            names = ["--repo_id=local/src", f"--root={source}", "--new_repo_id=local/dst", f"--new_root={target}"]
-            code = main(["resize", *names, "--size=[32,32]"])
-        finally:
-            os._exit(code)
-    return number
+def arguments(source, target):
+    names = ["--repo_id=local/src", f"--root={source}", "--new_repo_id=local/dst", f"--new_root={target}"]
+    return ["resize", *names, "--size=[32,32]"]
 
 
 def complete(target):
@@ -84,34 +76,36 @@ def wait_for(condition, process, seconds=60):
 
 def test_killed_at_any_moment_the_target_is_complete_or_absent_and_the_next_run_tidies_up(recording, tmp_path):
     before = snapshot(recording)
-    target = tmp_path / "dst"
-    begun = time.monotonic()
-    process = fork(recording, target)
-    assert os.waitpid(process, 0)[1] == 0
-    took = time.monotonic() - begun
-    complete(target)
-    absent = left = 0
-    for moment in MOMENTS:
-        shutil.rmtree(target, ignore_errors=True)
-        process = fork(recording, target)
-        time.sleep(moment * took)
-        os.kill(process, signal.SIGKILL)
-        os.waitpid(process, 0)
-        if target.exists():
-            complete(target)
-        absent += not target.exists()
-        left += any(tmp_path.glob(".dst.*.tmp"))
-        assert snapshot(recording) == before
+    folder = tmp_path / "out"
+    folder.mkdir()
+    target = folder / "dst"
+    with zygote("cqn_data.cli", tmp_path / "log", preload="cqn_data.write, cqn_data.readable") as processes:
+        begun = time.monotonic()
+        process = processes.start(*arguments(recording, target))
+        assert processes.wait(process) == 0
+        took = time.monotonic() - begun
+        complete(target)
+        absent = left = 0
+        for moment in MOMENTS:
+            shutil.rmtree(target, ignore_errors=True)
+            process = processes.start(*arguments(recording, target))
+            time.sleep(moment * took)
+            processes.kill(process)
+            if target.exists():
+                complete(target)
+            absent += not target.exists()
+            left += any(folder.glob(".dst.*.tmp"))
+            assert snapshot(recording) == before
     assert absent >= len(MOMENTS) // 3, "hardly any kill came in time; the moments are wrong"
     assert left, "no kill left anything; the moments are wrong"
     shutil.rmtree(target, ignore_errors=True)
-    (tmp_path / f".dst.{process}.tmp" / "videos").mkdir(parents=True, exist_ok=True)
+    (folder / f".dst.{process}.tmp" / "videos").mkdir(parents=True, exist_ok=True)
     done = start(recording, target)
     _, err = done.communicate(timeout=120)
     assert done.returncode == 0, err
     assert "which a killed process left behind" in err
     complete(target)
-    assert [p.name for p in tmp_path.iterdir()] == ["dst"]
+    assert [p.name for p in folder.iterdir()] == ["dst"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
