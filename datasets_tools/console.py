@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterable, Sequence
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -70,12 +71,12 @@ def table(columns: Sequence[str], rows: Sequence[Iterable[str]], total: Iterable
     for name in columns:
         view.add_column(name, justify="right", no_wrap=True)
     for row in rows[:MAX_ROWS]:
-        view.add_row(*row)
+        view.add_row(*map(escape, row))
     if len(rows) > MAX_ROWS:
         view.add_row(*["…"] * len(columns))
     if total := tuple(total):
         view.add_section()
-        view.add_row(*total, style="bold")
+        view.add_row(*map(escape, total), style="bold")
     Console().print(view)
     if len(rows) > MAX_ROWS:
         note(f"{len(rows) - MAX_ROWS} more rows are in the report (--report=FILE).")

@@ -4,6 +4,7 @@
 """
 
 import dataclasses
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -50,7 +51,10 @@ class InspectConfig:
     @property
     def page(self) -> Path | None:
         """Where the page goes."""
-        return Path(self.html).expanduser() if self.html else None if self.json else Path(PAGE)
+        if self.html:
+            return Path(self.html).expanduser()
+        numbered = (Path(PAGE if n == 1 else f"{Path(PAGE).stem}_{n}.html") for n in itertools.count(1))
+        return None if self.json else next(path for path in numbered if not path.exists())
 
 
 @dataclasses.dataclass
@@ -89,8 +93,9 @@ def main(args: list[str]) -> int:
     from .source import open_source
     from .target import refuse_existing
 
-    if config.page is not None:
-        refuse_existing(config.page)
+    page = config.page  # once: after it is written, the next free name is another one
+    if page is not None:
+        refuse_existing(page)
     try:
         source = open_source(config.repo_id, config.root)
     except DataError as error:
@@ -102,14 +107,14 @@ def main(args: list[str]) -> int:
         note(str(error))
         return 1
     inspection = inspect_dataset(config.repo_id, source)
-    if config.page is not None:
-        _write_page(config.page, inspection)
+    if page is not None:
+        _write_page(page, inspection)
     if config.json:
         _print_json(config, inspection)
     else:
         _show(inspection)
-    if config.page is not None:
-        (note if config.json else result)(f"Report: {config.page}")
+    if page is not None:
+        (note if config.json else result)(f"Report: {page}")
     return int(config.strict and not inspection.ok)
 
 

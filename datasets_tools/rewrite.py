@@ -49,6 +49,7 @@ def rewrite(view: View, repo_id: str, root: Path, bar: Progress) -> None:
         OutputExistsError: something is at ``root``.
     """
     source = view.source
+    _refuse_cut_videos(source)
     with new_folder(root) as folder:
         _copy_rest(source.root, folder, bar)
         stats = _write_numbers(view, folder, bar)
@@ -72,6 +73,17 @@ def write_bounds(folder: Path, bounds: Bounds | None) -> None:
     stats = json.loads(path.read_text())
     stats["action"] |= {"min": bounds.low.tolist(), "max": bounds.high.tolist()}
     path.write_text(json.dumps(stats, indent=4) + "\n")
+
+
+def _refuse_cut_videos(source: Source) -> None:
+    """Look at the last picture of every video file: what ends too early must not be copied as if it were whole."""
+    last = {(key, source.video_path(i, key)): i for key in source.meta.video_keys for i in source.episodes}
+    for (key, _), index in last.items():
+        if key not in source.cameras:  # depth
+            continue
+        episode = source.episode(index)
+        for _ in source.camera_frames(episode, np.array([len(episode) - 1]), {key: source.cameras[key]}):
+            pass
 
 
 def _copy_rest(source: Path, folder: Path, bar: Progress) -> None:

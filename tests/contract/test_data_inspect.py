@@ -82,8 +82,11 @@ def test_a_good_dataset_is_ready(good, tmp_path, capsys, monkeypatch):
     assert "http" not in page  # nothing is fetched from anywhere
     assert page.count("<svg") == page.count("</svg>") > 5
     assert "nan" not in re.findall(r'="([^"]*)"', page)
-    assert main(["inspect", "--repo_id=local/toy", f"--root={good}"]) == 2
+    written = (tmp_path / "inspect.html").stat().st_mtime_ns
+    assert "Report: inspect_2.html" in run(capsys, good)[0]  # once more, or another dataset
+    assert main(["inspect", "--repo_id=local/toy", f"--root={good}", "--html=inspect.html"]) == 2
     assert "inspect.html exists already" in capsys.readouterr().err
+    assert (tmp_path / "inspect.html").stat().st_mtime_ns == written
 
 
 def test_json_is_the_only_thing_on_stdout(good, tmp_path, capfd, monkeypatch):

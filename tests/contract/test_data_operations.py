@@ -131,8 +131,11 @@ def test_resize_and_crop(recording, tmp_path, capsys):
     assert "lies outside its 48x48 picture" in last_line(capsys)
 
 
-def test_drop_keeps_the_reason(recording, tmp_path):
-    dataset = run("drop", recording, tmp_path / "dst", "--episodes=[0]", "--where=steps < 15", "--reason=clumsy")
+def test_drop_keeps_the_reason(recording, tmp_path, capsys):
+    dataset = run(
+        "drop", recording, tmp_path / "dst", "--episodes=[0]", "--where=steps < 15", "--reason=clumsy [a] [/b]"
+    )
+    assert "clumsy [a] [/b]: steps < 15 (12)" in " ".join(capsys.readouterr().out.split())
     assert (dataset.num_episodes, dataset.num_frames) == (1, 31)
-    assert history(tmp_path / "dst")[0]["dropped"] == {"0": "clumsy", "1": "clumsy: steps < 15 (12)"}
+    assert history(tmp_path / "dst")[0]["dropped"] == {"0": "clumsy [a] [/b]", "1": "clumsy [a] [/b]: steps < 15 (12)"}
     assert what(dataset[4][TOP]) == (4, 2)

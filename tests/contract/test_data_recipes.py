@@ -103,6 +103,8 @@ def test_a_broken_video_is_named_or_its_episode_skipped(recording, tmp_path, cap
     assert str(path) in said
     assert "episode 1, frame" in said
     assert not (tmp_path / "dst").exists()
+    run("label", root, tmp_path / "copied", "--all", code=2)  # copying does not pass it on, either
+    assert str(path) in last_line(capsys)
     dataset = run("resize", root, tmp_path / "dst", "--size=[32,32]", "--skip_bad_episodes")
     assert "Left out episode 1" in capsys.readouterr().err
     assert [what(dataset[i][TOP])[1] for i in (0, 30)] == [0, 2]
