@@ -144,7 +144,7 @@ def test_a_loaded_policy_acts_as_the_trained_one(act_with: str, click: list[str]
         trainer = build(parse([*TINY_RUN, *click, *flags, f"--output_dir={tmp_path / 'run'}"]), monitor, stop)
     try:
         for _ in range(20):
-            trainer.update()
+            trainer.updates(1)
         trainer.save()
     finally:
         trainer.env.close()
