@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 from lerobot_cqn.errors import ConfigError, DataError, one_of
 
 from .cameras import Cameras
+from .env_config import check_cameras
 from .tasks import TASKS
 from .ur5e import HOME, STATE_NAMES, TIMESTEP, Arm
 
 if TYPE_CHECKING:
     from .expert import ScriptedTeleoperator
 
-__all__ = ["CAMERAS", "MAX_JOINT_SPEED", "OBS_TYPES", "UR5eStation"]
+__all__ = ["CAMERAS", "MAX_JOINT_SPEED", "UR5eStation"]
 
 CAMERAS = ("left_shoulder", "right_shoulder", "upper_wrist", "lower_wrist")
-OBS_TYPES = ("both", "pixels", "state")
 MAX_JOINT_SPEED = 1.0  # rad/s
 _LEASH = 0.25  # rad, how far the command may run ahead of the measured joint
 _HOME_SPREAD = 0.03  # rad, of each joint at the start
@@ -190,14 +190,6 @@ def check_settings(task: str, obs_type: str, cameras: list[str] | tuple[str, ...
     """
     if task not in TASKS:
         raise ConfigError(one_of("task", task, TASKS))
-    if obs_type not in OBS_TYPES:
-        raise ConfigError(one_of("obs_type", obs_type, OBS_TYPES))
-    for name in cameras:
-        if name not in CAMERAS:
-            raise ConfigError(one_of("camera", name, CAMERAS))
-    if len(set(cameras)) != len(cameras) or (obs_type != "state" and not cameras):
-        raise ConfigError(f"cameras is {list(cameras)}: expected at least one name, each once.")
-    if not 16 <= image_size <= 1024:
-        raise ConfigError(f"image_size is {image_size}: expected 16 to 1024 pixels.")
+    check_cameras(obs_type, cameras, CAMERAS, image_size)
     if fps not in (5, 10, 20, 25, 50):
         raise ConfigError(f"fps is {fps}: expected 5, 10, 20, 25 or 50 (whole physics steps of 4 ms).")
