@@ -1,11 +1,11 @@
-"""One gradient update: loss, AdamW on encoder and critic, Polyak step of the target (Algorithm 2)."""
+"""One gradient update: loss, AdamW, Polyak step of the target (Algorithm 2)."""
 
 from typing import Any
 
 import torch
 
-from .critic import CQNModel
 from .errors import CQNError
+from .model import Model
 from .schema import Batch
 
 __all__ = ["Learner", "NonFiniteLossError"]
@@ -18,7 +18,7 @@ class NonFiniteLossError(CQNError, ArithmeticError):
 class Learner:
     """Owns the optimiser of a model. Method names follow LeRobot's `RLAlgorithm`."""
 
-    def __init__(self, model: CQNModel) -> None:
+    def __init__(self, model: Model) -> None:
         self.model = model
         parameters = [p for p in model.parameters() if p.requires_grad]
         s = model.settings

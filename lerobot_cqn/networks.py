@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from .errors import ConfigError
 
-__all__ = ["CoarseToFineNetwork", "Projected", "Stream", "ViewEncoder"]
+__all__ = ["CoarseToFineNetwork", "Projected", "Stream", "ViewEncoder", "initialise", "projection", "zero_head"]
 
 # Kernel, stride and padding of every convolution (table 2; the kernel is the authors' choice).
 KERNEL, STRIDE, PADDING = 4, 2, 1
@@ -18,13 +18,17 @@ LAYER_NORM_EPS = 1e-5
 
 
 class ViewEncoder(nn.Module):
-    """Convolutions with layer norm over the channels at each pixel and SiLU, for one camera view."""
+    """Convolutions with layer norm over the channels at each pixel and SiLU, for one camera view.
 
-    def __init__(self, in_channels: int, height: int, width: int, channels: Sequence[int]) -> None:
+    plain: ReLU and no norm instead, as in DrQ-v2.
+    """
+
+    def __init__(self, in_channels: int, height: int, width: int, channels: Sequence[int], plain: bool = False) -> None:
         super().__init__()
+        self.plain = plain
         sizes = [in_channels, *channels]
         self.convolutions = nn.ModuleList(nn.Conv2d(a, b, KERNEL, STRIDE, PADDING) for a, b in pairwise(sizes))
-        self.norms = nn.ModuleList(nn.LayerNorm(c, eps=LAYER_NORM_EPS) for c in channels)
+        self.norms = nn.ModuleList(nn.Identity() if plain else nn.LayerNorm(c, eps=LAYER_NORM_EPS) for c in channels)
         for _ in channels:
             height, width = (
                 (height + 2 * PADDING - KERNEL) // STRIDE + 1,
@@ -42,7 +46,8 @@ class ViewEncoder(nn.Module):
         for convolution, norm in zip(self.convolutions, self.norms, strict=True):
             # Layer norm over the last axis of the channels-last view: no copy when memory is channels-last.
             features = norm(convolution(pixels).permute(0, 2, 3, 1))
-            pixels = F.silu(features, inplace=not features.requires_grad).permute(0, 3, 1, 2)
+            activate = F.relu if self.plain else F.silu
+            pixels = activate(features, inplace=not features.requires_grad).permute(0, 3, 1, 2)
         return pixels.flatten(1)
 
 
@@ -53,8 +58,9 @@ class Projected(NamedTuple):
     value: Tensor
 
 
-def _projection(inputs: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(inputs, outputs, bias=False), nn.LayerNorm(outputs, eps=LAYER_NORM_EPS), nn.Tanh())
+def projection(inputs: int, outputs: int, bias: bool = False) -> nn.Sequential:
+    """Linear, layer norm, tanh: what observations pass on their way into a trunk."""
+    return nn.Sequential(nn.Linear(inputs, outputs, bias=bias), nn.LayerNorm(outputs, eps=LAYER_NORM_EPS), nn.Tanh())
 
 
 class Stream(nn.Module):
@@ -74,8 +80,8 @@ class Stream(nn.Module):
         out: int,
     ) -> None:
         super().__init__()
-        self.pixel_projection = _projection(pixel_size, feature_dim) if pixel_size else None
-        self.low_dim_projection = _projection(low_dim_size, feature_dim) if low_dim_size else None
+        self.pixel_projection = projection(pixel_size, feature_dim) if pixel_size else None
+        self.low_dim_projection = projection(low_dim_size, feature_dim) if low_dim_size else None
         self.feature_size = feature_dim * (bool(pixel_size) + bool(low_dim_size))
         self.action_dims = dims
         self.first = nn.Linear(self.feature_size + dims + levels, hidden_dim, bias=False)

@@ -1,17 +1,19 @@
 """All numbers of the algorithm in one typed record, and the published columns of them as named presets."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from .errors import ConfigError, one_of
 
-__all__ = ["PRESETS", "CQNSettings", "resolve"]
+__all__ = ["DRQV2_PRESETS", "PRESETS", "CQNSettings", "CommonSettings", "DrQv2Settings", "resolve"]
 
 
 @dataclass(frozen=True)
-class CQNSettings:
-    """Hyperparameters; the defaults are the paper's RLBench column (table 2) unless a comment says otherwise.
+class CommonSettings:
+    """What every method here has: observation, networks, value distribution, losses, optimisation.
 
+    The defaults are the paper's RLBench column (table 2) unless a comment says otherwise.
     Raises ConfigError when a value is out of its range.
     """
 
@@ -21,48 +23,35 @@ class CQNSettings:
     brightness: float = 0.0  # factor drawn from 1 +- this
     contrast: float = 0.0
     state_bound: float = 2.0  # normalised state is cut here: demonstrations span [-1, 1]
-    # Discretisation
-    levels: int = 3  # L
-    bins: int = 5  # N
+    # Action
     action_margin: float = 0.0  # widens the action bounds by this share of the range, on each side
     # Networks
     encoder_channels: tuple[int, ...] = (32, 64, 128, 256)
     feature_dim: int = 64
     hidden_dim: int = 512
     # Value distribution
-    distributional: bool = True  # False: scalar Q, squared error and margin-only imitation
+    distributional: bool = True  # False: scalar Q and squared error
     atoms: int = 51  # A
     v_min: float = -1.0
     v_max: float = 1.0
     # Losses
-    rl_loss_scale: float = 0.1  # 0 gives the paper's CBC baseline
+    rl_loss_scale: float = 0.1  # 0 leaves imitation alone
     bc_loss_scale: float = 1.0
-    bc_dominance: bool = True  # False: margin only
-    bc_margin: float = 0.01  # the authors' implementation; the paper gives no number
     discount: float = 0.99  # the authors' implementation; the paper gives no number
     n_step: int = 3
-    centralized_critic: bool = False  # True: one value for the whole action, the mean over D (an ablation of the paper)
-    next_action_from: str = "online"  # the authors' double-Q style; "target" is equation 2 as written
     # Optimisation
     lr: float = 5e-5
     weight_decay: float = 0.1
     tau: float = 0.02
     # Acting
-    act_with: str = "target"
     exploration_noise: float = 0.01
-    random_bin_below: float = 1e-4  # exploring only: a spread of Q under this picks a random bin; 0 is off
     # Speed
     channels_last: bool = True
     bf16: bool = False
 
     def __post_init__(self) -> None:
         """Check ranges; every message names the field, the value found and what is allowed."""
-        at_least = {
-            "frame_stack": 1, "levels": 1, "bins": 2, "atoms": 2, "n_step": 1, "feature_dim": 1, "hidden_dim": 1,
-            "shift_pixels": 0, "brightness": 0, "contrast": 0, "action_margin": 0, "rl_loss_scale": 0,
-            "bc_loss_scale": 0, "bc_margin": 0, "exploration_noise": 0, "weight_decay": 0, "random_bin_below": 0,
-        }  # fmt: skip
-        for name, low in at_least.items():
+        for name, low in self.lowest().items():
             if not getattr(self, name) >= low:  # so that NaN is refused
                 raise ConfigError(f"`{name}` must be at least {low}, got {getattr(self, name)}.")
         for name in ("tau", "discount"):
@@ -78,21 +67,74 @@ class CQNSettings:
             raise ConfigError(f"`v_min` must be below `v_max`, got {self.v_min} and {self.v_max}.")
         if not self.encoder_channels or min(self.encoder_channels) < 1:
             raise ConfigError(f"`encoder_channels` must be positive numbers, got {self.encoder_channels}.")
-        for name in ("act_with", "next_action_from"):
-            if getattr(self, name) not in ("online", "target"):
-                raise ConfigError(one_of(f"value of `{name}`", getattr(self, name), ("online", "target")))
         if self.rl_loss_scale == 0 and self.bc_loss_scale == 0:
             raise ConfigError("Nothing to learn: `rl_loss_scale` and `bc_loss_scale` are both 0; set one above 0.")
 
+    def lowest(self) -> dict[str, float]:
+        """The least value of each number that has one."""
+        return {
+            "frame_stack": 1, "atoms": 2, "n_step": 1, "feature_dim": 1, "hidden_dim": 1, "shift_pixels": 0,
+            "brightness": 0, "contrast": 0, "action_margin": 0, "rl_loss_scale": 0, "bc_loss_scale": 0,
+            "exploration_noise": 0, "weight_decay": 0,
+        }  # fmt: skip
+
     @property
     def critic_atoms(self) -> int:
-        """A: outputs of the critic per bin."""
+        """A: outputs of the critic per bin or action."""
         return self.atoms if self.distributional else 1
 
 
+@dataclass(frozen=True)
+class CQNSettings(CommonSettings):
+    """Hyperparameters of CQN. Raises ConfigError when a value is out of its range."""
+
+    # Discretisation
+    levels: int = 3  # L
+    bins: int = 5  # N
+    # Losses; rl_loss_scale=0 gives the paper's CBC baseline, distributional=False also margin-only imitation
+    bc_dominance: bool = True  # False: margin only
+    bc_margin: float = 0.01  # the authors' implementation; the paper gives no number
+    centralized_critic: bool = False  # True: one value for the whole action, the mean over D (an ablation of the paper)
+    next_action_from: str = "online"  # the authors' double-Q style; "target" is equation 2 as written
+    # Acting
+    act_with: str = "target"
+    random_bin_below: float = 1e-4  # exploring only: a spread of Q under this picks a random bin; 0 is off
+
+    def __post_init__(self) -> None:
+        """Check ranges, and the two choices of a critic."""
+        super().__post_init__()
+        for name in ("act_with", "next_action_from"):
+            if getattr(self, name) not in ("online", "target"):
+                raise ConfigError(one_of(f"value of `{name}`", getattr(self, name), ("online", "target")))
+
+    def lowest(self) -> dict[str, float]:
+        """The least value of each number that has one."""
+        return {**super().lowest(), "levels": 1, "bins": 2, "bc_margin": 0, "random_bin_below": 0}
+
+
+@dataclass(frozen=True)
+class DrQv2Settings(CommonSettings):
+    """Hyperparameters of DrQ-v2 and DrQ-v2+; the defaults are DrQ-v2+'s column of the paper's last table.
+
+    Raises ConfigError when a value is out of its range.
+    """
+
+    atoms: int = 101
+    rl_loss_scale: float = 1.0
+    lr: float = 1e-4
+    tau: float = 0.01
+    noise_clip: float = 0.3  # of the noise on actions inside the losses (Yarats et al. 2022)
+
+    def lowest(self) -> dict[str, float]:
+        """The least value of each number that has one."""
+        return {**super().lowest(), "noise_clip": 0}
+
+
 _DMC: dict[str, Any] = {
-    # Appendix "DeepMind Control Experiments": value bounds, exploration noise; no demonstrations.
+    # Appendix "DeepMind Control Experiments": value bounds, exploration noise; no demonstrations, and so no statistics
+    # to scale the state by, which is why it is not cut either.
     "v_min": 0.0, "v_max": 200.0, "exploration_noise": 0.1, "bc_loss_scale": 0.0, "rl_loss_scale": 1.0,
+    "state_bound": 1e6,
 }  # fmt: skip
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -110,15 +152,24 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-def resolve(preset: str, overrides: dict[str, Any]) -> CQNSettings:
+DRQV2_PRESETS: dict[str, dict[str, Any]] = {
+    # Last table of the paper's appendix.
+    "drqv2_plus": {},
+    "drqv2": {"distributional": False, "exploration_noise": 0.2, "weight_decay": 0.0},
+}
+
+
+def resolve[S: CommonSettings](
+    kind: type[S], presets: Mapping[str, Mapping[str, Any]], preset: str, overrides: Mapping[str, Any]
+) -> S:
     """Settings of a preset with the given fields replaced; None leaves the preset's value.
 
     Raises ConfigError for an unknown preset or a value out of range.
     """
-    if preset not in PRESETS:
-        raise ConfigError(one_of("preset", preset, PRESETS))
-    names = {field.name for field in fields(CQNSettings)}
+    if preset not in presets:
+        raise ConfigError(one_of("preset", preset, presets))
+    names = {field.name for field in fields(kind)}
     given = {name: value for name, value in overrides.items() if value is not None and name in names}
     if "encoder_channels" in given:
         given["encoder_channels"] = tuple(given["encoder_channels"])
-    return replace(CQNSettings(**PRESETS[preset]), **given)
+    return replace(kind(**presets[preset]), **given)

@@ -8,8 +8,8 @@ import torch
 from lerobot.processor import PolicyProcessorPipeline
 from numpy.typing import NDArray
 
+from lerobot_cqn.base_policy import RLPolicy
 from lerobot_cqn.errors import DataError
-from lerobot_cqn.modeling_cqn import CQNPolicy
 
 from .interfaces import Frame
 from .replay import Episode
@@ -21,7 +21,7 @@ __all__ = ["Agent", "Recorder"]
 class Agent:
     """The policy and the pipelines that are saved with it."""
 
-    policy: CQNPolicy
+    policy: RLPolicy
     preprocessor: PolicyProcessorPipeline[Any, Any]
     postprocessor: PolicyProcessorPipeline[Any, Any]
 

@@ -17,7 +17,6 @@ from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_cqn.configuration_cqn import CQNConfig
 from lerobot_cqn.errors import ConfigError, CQNError, one_of
 
 from .checkpoint import last_checkpoint
@@ -139,9 +138,12 @@ def _option_error(complaint: str, arguments: Sequence[str]) -> str:
 def _options(arguments: Sequence[str]) -> list[str]:
     """Every option there is for the chosen environment."""
     groups: dict[str, type] = {
-        "": RunConfig, "policy.": CQNConfig, "dataset.": DatasetSettings, "eval.": EvalSettings,
+        "": RunConfig, "dataset.": DatasetSettings, "eval.": EvalSettings,
         "wandb.": WandBSettings,
     }  # fmt: skip
+    policy = parser.parse_arg("policy.type", list(arguments)) or "cqn"
+    if policy in PreTrainedConfig.get_known_choices():
+        groups["policy."] = PreTrainedConfig.get_choice_class(policy)
     env = parser.parse_arg("env.type", list(arguments))
     if env in EnvConfig.get_known_choices():
         groups["env."] = EnvConfig.get_choice_class(env)

@@ -21,13 +21,14 @@ from lerobot.configs import parser
 from lerobot.configs.types import FeatureType
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import env_to_policy_features
-from lerobot.policies.factory import make_policy, make_pre_post_processors
+from lerobot.policies.factory import get_policy_class, make_policy, make_pre_post_processors
+from lerobot.utils.constants import ACTION
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_cqn.configuration_cqn import CQNConfig
+from lerobot_cqn.base_config import RLConfig
+from lerobot_cqn.base_policy import RLPolicy
 from lerobot_cqn.errors import ConfigError, CQNError, OutputExistsError
 from lerobot_cqn.learner import Learner
-from lerobot_cqn.modeling_cqn import CQNPolicy
 
 from . import envs  # noqa: F401  # registers our environments
 from .agent import Agent
@@ -36,9 +37,10 @@ from .checkpoint import Counters, last_checkpoint, restore, save, seed_everythin
 from .config import RunConfig
 from .console import ConsoleMonitor
 from .demonstrations import load_episodes, load_metadata
-from .gym_env import GymEnvironment
+from .gym_env import GymEnvironment, GymScenes, OneScene
+from .interfaces import Scenes
 from .look import draw_batch, warnings_about
-from .metrics import Metrics, start_wandb
+from .metrics import Log, Metrics, start_tensorboard, start_wandb
 from .online import Interrupted, Trainer
 from .replay import Episode, Replay
 
@@ -48,7 +50,7 @@ __all__ = ["main"]
 def build(config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], bool]) -> Trainer:
     """Check everything, then make every part of a run. Raises CQNError before any work is done."""
     config.validate()
-    assert isinstance(config.policy, CQNConfig)  # noqa: S101  # validate has checked these three
+    assert isinstance(config.policy, RLConfig)  # noqa: S101  # validate has checked these three
     assert config.env is not None and config.output_dir is not None  # noqa: S101, PT018
     checkpoint = last_checkpoint(config.output_dir) if config.resume else None
     if not config.resume and config.output_dir.exists() and any(config.output_dir.iterdir()):
@@ -58,10 +60,13 @@ def build(config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], 
     if config.threads:
         torch.set_num_threads(config.threads)
     rng = seed_everything(config.seed)
-    agent = make_agent(config, checkpoint)
+    env = GymEnvironment(config.env, config.policy)
+    agent = make_agent(config, checkpoint, env)
     check_fits(config.env, agent.policy)
     s = config.policy.settings
-    env = GymEnvironment(config.env, config.policy)
+    scenes: Scenes = OneScene(env)
+    if config.eval.batch_size > 1:
+        scenes = GymScenes(config.env, config.policy, config.eval.batch_size)
     replay = Replay(
         s.frame_stack, s.n_step, s.discount, folder=config.output_dir / "replay",
         capacity_gib=config.replay.capacity_gib, by_step=config.replay.sampling == "steps",
@@ -80,13 +85,15 @@ def build(config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], 
     run_config = draccus.encode(config)
     if checkpoint is None and replay.episodes:
         picture = config.output_dir / "first_batch.png"
-        sizes = (min(4, config.schedule["batch_size"]), 4 if replay.demonstrations else 0)
+        sizes = (min(4, config.recipe.batch_size), 4 if replay.demonstrations else 0)
         draw_batch(replay.sample(*sizes, np.random.default_rng(config.seed)), picture)
         monitor.message(f"First batch: {picture}")
-    wandb = None
+    also: list[Log] = []
+    if config.tensorboard:
+        also.append(start_tensorboard(config.output_dir / "tensorboard"))
     if config.wandb.enable:
-        wandb = _start_wandb(config, run_config)
-    metrics = Metrics(config.output_dir, wandb)
+        also.append(start_wandb(config.wandb.project, config.output_dir.name, run_config, config.wandb.mode))
+    metrics = Metrics(config.output_dir, also)
     learner, counters = Learner(agent.policy.model), Counters()
     if checkpoint is not None:
         counters, tables = restore(checkpoint, learner, rng)
@@ -101,7 +108,7 @@ def build(config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], 
         )  # fmt: skip
 
     return Trainer(
-        config, agent, learner, env, replay, metrics, monitor, rng, counters, save_checkpoint, should_stop,
+        config, agent, learner, env, scenes, replay, metrics, monitor, rng, counters, save_checkpoint, should_stop,
         finished_since=finished,
     )  # fmt: skip
 
@@ -119,42 +126,39 @@ def _nothing_left(folder: Path | None) -> Iterator[None]:
         raise
 
 
-def make_agent(config: RunConfig, checkpoint: Path | None) -> Agent:
-    """Policy and processors: new ones from the dataset's statistics, or those of a checkpoint."""
-    assert isinstance(config.policy, CQNConfig) and config.env is not None  # noqa: S101, PT018
+def make_agent(config: RunConfig, checkpoint: Path | None, env: GymEnvironment) -> Agent:
+    """Policy and processors: new ones from the dataset's statistics, or those of a checkpoint.
+
+    Without a dataset the features are the environment's and the state stays as it is.
+    """
+    assert isinstance(config.policy, RLConfig) and config.env is not None  # noqa: S101, PT018
     pretrained = checkpoint / "pretrained_model" if checkpoint is not None else config.policy.pretrained_path
+    policy: Any
     if pretrained is not None:
         try:
-            policy = CQNPolicy.from_pretrained(pretrained, config=config.policy)
+            policy = get_policy_class(config.policy.type).from_pretrained(pretrained, config=config.policy)
         except RuntimeError as error:  # torch names every tensor that differs
             raise ConfigError(
                 f"The weights in {pretrained} do not fit: leave out the --policy.* settings that change the network "
                 "(sizes, levels, bins, atoms, frame_stack), or start anew."
             ) from error
         pre, post = make_pre_post_processors(config.policy, pretrained_path=str(pretrained))
-    elif config.dataset.repo_id:
-        meta = load_metadata(config.dataset)
-        policy = make_policy(config.policy, ds_meta=meta)
-        pre, post = make_pre_post_processors(config.policy, dataset_stats=meta.stats)
     else:
-        raise ConfigError("A new policy needs a dataset for its features and action bounds: give --dataset.repo_id=...")
+        stats: dict[str, dict[str, Any]] = {}
+        if config.dataset.repo_id:
+            meta = load_metadata(config.dataset)
+            policy = make_policy(config.policy, ds_meta=meta)
+            stats = dict(meta.stats)
+        else:
+            policy = make_policy(config.policy, env_cfg=config.env)
+        if config.recipe.action_bounds == "environment":
+            stats[ACTION] = env.action_bounds()
+        pre, post = make_pre_post_processors(config.policy, dataset_stats=stats)
     policy.train()
     return Agent(policy, pre, post)
 
 
-def _start_wandb(config: RunConfig, run_config: Any) -> Any:
-    assert config.output_dir is not None  # noqa: S101
-    try:
-        return start_wandb(config.wandb.project, config.output_dir.name, run_config, config.wandb.mode)
-    except CQNError:
-        raise
-    except Exception as error:  # wandb raises many kinds
-        raise ConfigError(
-            f"Weights & Biases does not start: {error} Log in with `wandb login`, or give --wandb.mode=offline."
-        ) from error
-
-
-def check_fits(env: EnvConfig, policy: CQNPolicy) -> None:
+def check_fits(env: EnvConfig, policy: RLPolicy) -> None:
     """Environment and policy must speak of the same things. Raises ConfigError, in one line, where they do not."""
     given, needed = env_to_policy_features(env), policy.config.input_features or {}
     for key, feature in needed.items():
@@ -247,7 +251,7 @@ def run(config: RunConfig) -> int:
         return 0
     finally:
         if trainer is not None:
-            trainer.env.close()
+            trainer.close()
 
 
 def set_up_logging(debug: bool) -> None:

@@ -5,10 +5,11 @@ from dataclasses import dataclass, field
 from math import sqrt
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from .agent import Agent
-from .interfaces import Environment
+from .interfaces import Scenes
 
 __all__ = ["EVAL_SEED", "Evaluation", "evaluate", "wilson_interval"]
 
@@ -19,10 +20,14 @@ EVAL_SEED = 2_147_000_000
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What evaluation episodes came to; steps: their lengths; frames: pictures of the first episodes."""
+    """What evaluation episodes came to.
+
+    outcomes: success; steps: lengths; returns: sums of rewards; frames: pictures of the first episodes.
+    """
 
     outcomes: list[bool]
     steps: list[int]
+    returns: list[float]
     frames: list[list[NDArray[Any]]] = field(default_factory=list)
 
     @property
@@ -41,14 +46,20 @@ class Evaluation:
         return self.successes / self.n
 
     @property
+    def mean_return(self) -> float:
+        """Mean sum of rewards of an episode."""
+        return float(np.mean(self.returns))
+
+    @property
     def interval(self) -> tuple[float, float]:
         """95 % Wilson interval of the success rate."""
         return wilson_interval(self.successes, self.n)
 
     def __str__(self) -> str:
-        """For a person: rate, n and interval."""
+        """For a person: rate, n and interval; the return where it says more than the rate."""
         low, high = self.interval
-        return f"{self.success_rate:.2f} (n={self.n}, 95 % {low:.2f}-{high:.2f})"
+        text = f"{self.success_rate:.2f} (n={self.n}, 95 % {low:.2f}-{high:.2f})"
+        return text if abs(self.mean_return - self.success_rate) < 1e-6 else f"{text}  return {self.mean_return:.1f}"
 
 
 def wilson_interval(successes: int, n: int, z: float = 1.959964) -> tuple[float, float]:
@@ -61,29 +72,60 @@ def wilson_interval(successes: int, n: int, z: float = 1.959964) -> tuple[float,
 
 def evaluate(
     agent: Agent,
-    env: Environment,
+    scenes: Scenes,
     episodes: int,
     *,
     seed: int = EVAL_SEED,
     on_episode: Callable[[int], None] = lambda _: None,
     film: int = 0,
 ) -> Evaluation:
-    """Run `episodes` episodes without noise, as lerobot-eval does. film: episodes to take pictures of."""
-    outcomes, steps, films = [], [], []
-    for index in range(episodes):
-        agent.policy.reset()
-        frame, film_frames = env.reset(seed + index), []
-        for count in range(1, env.max_steps + 1):  # noqa: B007  # read after the loop
-            if index < film:
-                film_frames.append(env.render())
-            action, _ = agent.act(agent.prepare(frame), explore=False)
-            outcome = env.step(agent.postprocessor(action))
-            frame = outcome.frame
-            if outcome.success or outcome.terminated or outcome.truncated:
-                break
-        if index < film:
-            films.append([*film_frames, env.render()])
-        outcomes.append(outcome.success)
-        steps.append(count)
-        on_episode(index + 1)
-    return Evaluation(outcomes, steps, films)
+    """Run `episodes` episodes without noise, as lerobot-eval does, as many at a time as there are scenes.
+
+    film: episodes to take pictures of. Episode i has seed + i, however many run at a time.
+    """
+    outcomes: list[bool] = []
+    steps: list[int] = []
+    returns: list[float] = []
+    films: list[list[NDArray[Any]]] = []
+    for first in range(0, episodes, scenes.count):
+        numbers = range(first, min(first + scenes.count, episodes))
+        success, length, total, pictures = _wave(agent, scenes, seed + first, max(0, film - first))
+        outcomes += success.tolist()[: len(numbers)]
+        steps += length.tolist()[: len(numbers)]
+        returns += total.tolist()[: len(numbers)]
+        films += pictures[: len(numbers)]
+        on_episode(numbers[-1] + 1)
+    return Evaluation(outcomes, steps, returns, films[:film])
+
+
+def _wave(
+    agent: Agent, scenes: Scenes, seed: int, film: int
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], list[list[NDArray[Any]]]]:
+    """One episode in each scene: success, length and return [K], and pictures of the first `film`."""
+    agent.policy.reset()
+    frame = scenes.reset([seed + k for k in range(scenes.count)])
+    running, success = np.ones(scenes.count, dtype=bool), np.zeros(scenes.count, dtype=bool)
+    length, total = np.zeros(scenes.count, dtype=int), np.zeros(scenes.count)
+    films: list[list[NDArray[Any]]] = [[] for _ in range(min(film, scenes.count))]
+
+    def look() -> None:
+        pictures = scenes.render() if running[: len(films)].any() else []
+        for k, shown in enumerate(films):
+            if running[k]:
+                shown.append(pictures[k])
+
+    for _ in range(scenes.max_steps):
+        look()
+        action, _ = agent.act(agent.prepare(frame), explore=False)
+        outcome = scenes.step(agent.postprocessor(action))
+        frame = outcome.frame
+        length += running
+        total += np.where(running, outcome.reward, 0.0)
+        success |= running & outcome.success
+        running &= ~outcome.ended
+        if not running.any():
+            break
+    # The last picture of an episode that ends together with the others; one that ended before has begun anew.
+    if scenes.count == 1 and films:
+        films[0].append(scenes.render()[0])
+    return success, length, total, films

@@ -1,12 +1,13 @@
 """What the loop needs from the world; environments and arms meet it here, and only here."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
 from numpy.typing import NDArray
 
-__all__ = ["Environment", "Frame", "Outcome"]
+__all__ = ["Environment", "Frame", "Outcome", "Outcomes", "Scenes"]
 
 Frame = dict[str, Any]
 
@@ -53,4 +54,44 @@ class Environment(Protocol):
 
     def close(self) -> None:
         """Free the simulator."""
+        ...
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """What one control step brought in K scenes; `frame` has K rows, the arrays are [K]."""
+
+    frame: Frame
+    reward: NDArray[Any]
+    ended: NDArray[Any]
+    success: NDArray[Any]
+
+
+class Scenes(Protocol):
+    """K environments that step together, for evaluation."""
+
+    @property
+    def count(self) -> int:
+        """K."""
+        ...
+
+    @property
+    def max_steps(self) -> int:
+        """Control steps before an episode is cut off."""
+        ...
+
+    def reset(self, seeds: Sequence[int]) -> Frame:
+        """Start an episode in each, as its seed says; rows [K, ...]."""
+        ...
+
+    def step(self, action: torch.Tensor) -> Outcomes:
+        """Apply actions [K, D] in the environment's own units; what comes after an episode's end does not count."""
+        ...
+
+    def render(self) -> Sequence[NDArray[Any]]:
+        """K pictures for a person, uint8 [H, W, 3]."""
+        ...
+
+    def close(self) -> None:
+        """Free the simulators."""
         ...

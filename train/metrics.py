@@ -1,31 +1,39 @@
-"""Metrics as CSV files, one row at a time, flushed; and, on request, to Weights & Biases (docs/metrics.md)."""
+"""Metrics as CSV files, one row at a time, flushed; on request to TensorBoard and Weights & Biases, too."""
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from lerobot_cqn.errors import ConfigError
 
-__all__ = ["COLUMNS", "Metrics"]
+__all__ = ["COLUMNS", "Log", "Metrics", "start_tensorboard", "start_wandb"]
+
+Log = Callable[[Mapping[str, float]], Any]
 
 COLUMNS: dict[str, tuple[str, ...]] = {
-    "updates": ("updates", "env_steps", "loss", "rl_loss", "bc_dominance_loss", "bc_margin_loss", "wall_s"),
+    "updates": (
+        "updates", "env_steps", "loss", "rl_loss", "bc_dominance_loss", "bc_margin_loss", "actor_loss",
+        "bc_action_loss", "wall_s",
+    ),
     "episodes": (
         "episode", "env_steps", "updates", "length", "success", "return", "mean_q", "demonstrations", "wall_s",
     ),
     "evaluations": (
         "phase", "env_steps", "updates", "episodes", "n", "successes", "success_rate", "ci_low", "ci_high",
-        "mean_length", "wall_s",
+        "mean_length", "mean_return", "wall_s",
     ),
 }  # fmt: skip
 
 
 class Metrics:
-    """Three tables in `output_dir`: updates.csv, episodes.csv, evaluations.csv."""
+    """Three tables in `output_dir`: updates.csv, episodes.csv, evaluations.csv (docs/metrics.md).
 
-    def __init__(self, output_dir: Path, wandb: Any = None) -> None:
-        self.output_dir, self._wandb = output_dir, wandb
+    also: called with each row's numbers as `{"<table>/<column>": value}`.
+    """
+
+    def __init__(self, output_dir: Path, also: Sequence[Log] = ()) -> None:
+        self.output_dir, self._also = output_dir, also
         for table, columns in COLUMNS.items():
             path = output_dir / f"{table}.csv"
             if not path.exists():
@@ -36,8 +44,9 @@ class Metrics:
         with (self.output_dir / f"{table}.csv").open("a", newline="") as file:
             writer = csv.DictWriter(file, COLUMNS[table], restval="", extrasaction="ignore")
             writer.writerow({name: _text(value) for name, value in row.items()})
-        if self._wandb is not None:
-            self._wandb.log({f"{table}/{k}": v for k, v in row.items() if isinstance(v, int | float)})
+        numbers = {f"{table}/{k}": v for k, v in row.items() if isinstance(v, int | float)}
+        for log in self._also:
+            log(numbers)
 
     def sizes(self) -> dict[str, int]:
         """Bytes of each table, for a checkpoint."""
@@ -54,10 +63,35 @@ def _text(value: Any) -> Any:
     return f"{value:.6g}" if isinstance(value, float) else value
 
 
-def start_wandb(project: str, name: str, config: Mapping[str, Any], mode: Any) -> Any:
-    """A Weights & Biases run. Raises ConfigError when the package is missing."""
+def start_wandb(project: str, name: str, config: Mapping[str, Any], mode: Any) -> Log:
+    """A Weights & Biases run. Raises ConfigError when the package is missing or the run does not start."""
     try:
         import wandb
     except ImportError as error:
         raise ConfigError("`--wandb.enable` needs the extra: pip install 'lerobot_policy_cqn[wandb]'.") from error
-    return wandb.init(project=project, name=name, config=dict(config), mode=mode)
+    try:
+        run = wandb.init(project=project, name=name, config=dict(config), mode=mode)
+    except Exception as error:  # wandb raises many kinds
+        raise ConfigError(
+            f"Weights & Biases does not start: {error} Log in with `wandb login`, or give --wandb.mode=offline."
+        ) from error
+    return lambda numbers: run.log(dict(numbers))
+
+
+def start_tensorboard(folder: Path) -> Log:
+    """TensorBoard events in `folder`, over environment steps. Raises ConfigError when the package is missing."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise ConfigError("`--tensorboard` needs the extra: pip install 'lerobot_policy_cqn[tensorboard]'.") from error
+    writer = SummaryWriter(str(folder))
+
+    def log(numbers: Mapping[str, float]) -> None:
+        table = next(iter(numbers)).partition("/")[0]
+        # Offline updates all happen at step 0: what is logged with each update goes over updates.
+        step = int(numbers.get(f"{table}/{'updates' if table == 'updates' else 'env_steps'}", 0))
+        for name, value in numbers.items():
+            writer.add_scalar(name, value, step)
+        writer.flush()
+
+    return log

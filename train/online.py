@@ -15,7 +15,7 @@ from .agent import Agent, Recorder
 from .checkpoint import Counters
 from .config import RunConfig
 from .evaluate import Evaluation, evaluate
-from .interfaces import Environment
+from .interfaces import Environment, Scenes
 from .look import save_batch, write_films
 from .metrics import Metrics
 from .replay import Replay
@@ -54,6 +54,7 @@ class Trainer:
     agent: Agent
     learner: Learner
     env: Environment
+    scenes: Scenes
     replay: Replay
     metrics: Metrics
     monitor: Monitor
@@ -75,6 +76,11 @@ class Trainer:
         self.evaluate("final", self.config.eval.final_n_episodes)
         self.save()
 
+    def close(self) -> None:
+        """Free the simulators."""
+        self.scenes.close()
+        self.env.close()
+
     def _offline(self) -> None:
         total = self.config.offline_updates
         self.monitor.phase("offline", total, self.counters.updates)
@@ -94,7 +100,7 @@ class Trainer:
             except Interrupted:  # the unfinished episode is dropped, so its steps do not count either
                 c.env_steps = before
                 raise
-            self.updates(self.config.schedule["updates_per_episode"])
+            self.updates(self.config.recipe.updates_per_episode)
             if freq and c.env_steps // freq > before // freq and c.env_steps < self.config.steps:
                 self.evaluate("online", self.config.eval.n_episodes)
             if c.env_steps // self.config.save_freq > before // self.config.save_freq:
@@ -116,13 +122,13 @@ class Trainer:
             recorder.observe(prepared)
             q_values.append(q)
             c.env_steps += 1
-            self.updates(self.config.schedule["updates_per_step"])
+            self.updates(self.config.recipe.updates_per_step)
             if self.should_stop():
                 raise Interrupted
             if outcome.terminated or outcome.truncated:
                 break
         episode = recorder.episode(terminated=outcome.terminated, success=outcome.success)
-        demo = self.config.relabel and outcome.success
+        demo = self.config.recipe.relabel and outcome.success
         row = {
             "episode": c.episodes, "length": len(episode), "success": int(outcome.success),
             "return": float(episode.reward.sum()), "mean_q": float(np.mean(q_values)),
@@ -137,7 +143,9 @@ class Trainer:
 
     def updates(self, count: int, on_update: Callable[[], None] = lambda: None) -> None:
         """Gradient updates on batches from both stores, the next one put together meanwhile."""
-        sizes = self.config.schedule["batch_size"], self.config.schedule["demo_batch_size"]
+        if not self.replay.episodes:  # without demonstrations learning begins after the first episode
+            return
+        sizes = self.config.recipe.batch_size, self.config.recipe.demo_batch_size
         with contextlib.closing(self.replay.batches(count, *sizes, self.rng)) as batches:
             for batch in batches:
                 stats = self._update(batch)
@@ -159,11 +167,11 @@ class Trainer:
 
     def take_up(self, places: Sequence[Place]) -> None:
         """Episodes that were finished after the last checkpoint: they count, and their updates are made again."""
-        schedule, owed = self.config.schedule, 0
+        recipe, owed = self.config.recipe, 0
         for place in places:
             self.metrics.write("episodes", place.note)
             self.counters.episodes, self.counters.env_steps = place.number + 1, int(place.note["env_steps"])
-            owed += place.length * schedule["updates_per_step"] + schedule["updates_per_episode"]
+            owed += place.length * recipe.updates_per_step + recipe.updates_per_episode
         if places:
             self.monitor.message(f"{len(places)} episodes after the last checkpoint are kept; {owed} updates again.")
         self.updates(owed)
@@ -176,7 +184,7 @@ class Trainer:
                 raise Interrupted
 
         films = self.config.eval.videos
-        result = evaluate(self.agent, self.env, episodes, on_episode=look, film=films)
+        result = evaluate(self.agent, self.scenes, episodes, on_episode=look, film=films)
         if films:
             stem = f"{phase}_{self.counters.env_steps:06d}"
             write_films(result.frames, result.outcomes, self.metrics.output_dir / "videos", stem, self.env.fps)
@@ -185,7 +193,7 @@ class Trainer:
         row = {
             "phase": phase, "episodes": self.counters.episodes, "n": result.n, "successes": result.successes,
             "success_rate": result.success_rate, "ci_low": low, "ci_high": high,
-            "mean_length": float(np.mean(result.steps)),
+            "mean_length": float(np.mean(result.steps)), "mean_return": result.mean_return,
         }  # fmt: skip
         self.metrics.write("evaluations", row | self._progress())
         self.monitor.message(f"{phase:>8}  step {self.counters.env_steps:>6}  success {result}")

@@ -22,7 +22,7 @@ from . import figures
 from .agent import Agent
 from .envs.registration import UR5eStationEnv
 from .evaluate import EVAL_SEED, Evaluation, evaluate, wilson_interval
-from .gym_env import GymEnvironment
+from .gym_env import GymEnvironment, OneScene
 
 if TYPE_CHECKING:
     from .demo import DemoConfig
@@ -137,7 +137,7 @@ def run_policy(pretrained: Path, env_config: EnvConfig, seed: int, episodes: int
         policy = CQNPolicy.from_pretrained(pretrained)
     pre, post = make_pre_post_processors(policy.config, pretrained_path=str(pretrained))
     env = GymEnvironment(env_config, policy.config)
-    result = evaluate(Agent(policy, pre, post), env, episodes, seed=seed, film=film)
+    result = evaluate(Agent(policy, pre, post), OneScene(env), episodes, seed=seed, film=film)
     env.close()
     return result
 

@@ -31,8 +31,9 @@ MEETING_PLACE = "train.interfaces"
 # --- Inside lerobot_cqn: each module and the siblings it may import.
 _BASE = {"errors", "schema"}
 _PURE = {"intervals", "distributional", "augmentation"}  # tensors in, tensors out: never a config
-_SETTINGS = {"settings", "configuration_cqn"}
+_SETTINGS = {"settings", "base_config"}
 _MATHS = _BASE | _PURE | {"losses"}
+_NETWORKS = _MATHS | {"settings", "networks", "model"}
 SIBLINGS: dict[str, set[str]] = {
     "errors": set(),
     "schema": {"errors"},
@@ -42,16 +43,29 @@ SIBLINGS: dict[str, set[str]] = {
     "losses": _BASE | {"intervals", "distributional"},
     "settings": _BASE,
     "networks": _MATHS | {"settings"},
-    "critic": _MATHS | {"settings", "networks"},
-    "learner": _MATHS | {"settings", "networks", "critic"},
+    "model": _MATHS | {"settings", "networks"},
+    "critic": _NETWORKS,
+    "actor_critic": _NETWORKS,
+    "learner": _BASE | {"model"},
     # What LeRobot sees; the modules above know nothing of it.
-    "configuration_cqn": _BASE | {"settings"},
-    "processor_cqn": _BASE | _SETTINGS,
-    "modeling_cqn": _MATHS | _SETTINGS | {"networks", "critic", "learner", "processor_cqn"},
+    "base_config": _BASE | {"settings"},
+    "base_policy": _BASE | _SETTINGS | {"model"},
+    "processors": _BASE | _SETTINGS,
+    "configuration_cqn": _SETTINGS,
+    "processor_cqn": {"configuration_cqn", "processors"},
+    "modeling_cqn": {"base_policy", "configuration_cqn", "critic"},
+    "configuration_drqv2": _SETTINGS,
+    "processor_drqv2": {"configuration_drqv2", "processors"},
+    "modeling_drqv2": {"base_policy", "configuration_drqv2", "actor_critic"},
 }
 
 # --- Packages of the extras: imported on use, so that everything else works without them.
-OPTIONAL = frozenset({"mujoco", "matplotlib", "wandb", "fastapi", "uvicorn", "h5py", "zarr", "rliable"})
+OPTIONAL = frozenset(
+    {
+        "mujoco", "matplotlib", "wandb", "tensorboard", "fastapi", "uvicorn", "h5py", "zarr", "rliable", "metaworld",
+        "dm_control", "gym_hil", "gym_pusht", "gym_aloha", "rlbench", "pyrep",
+    }
+)  # fmt: skip
 # Modules that need one at their top; they in turn are imported only inside functions or by one another.
 IMPORTED_ON_USE = frozenset[str]()
 

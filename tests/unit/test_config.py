@@ -11,7 +11,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, PolicyFeature
 
 import cqn_train.envs  # noqa: F401  # registers the station
-from cqn_train.config import RunConfig
+from cqn_train.config import Recipe, RunConfig
 from lerobot_cqn import settings as settings_module
 from lerobot_cqn.configuration_cqn import CQNConfig
 from lerobot_cqn.errors import ConfigError
@@ -146,17 +146,20 @@ def test_lerobots_optimiser_is_the_papers() -> None:
     assert settings.get_scheduler_preset() is None
 
 
-def test_the_schedule_follows_the_policys_preset() -> None:
-    def schedule(*arguments: str) -> dict[str, int]:
-        return draccus.parse(RunConfig, args=["--policy.type=cqn", "--policy.device=cpu", *arguments]).schedule
+def test_the_recipe_follows_the_policys_preset() -> None:
+    def recipe(*arguments: str, policy: str = "cqn") -> Recipe:
+        start = [f"--policy.type={policy}", "--policy.device=cpu"]
+        return draccus.parse(RunConfig, args=[*start, *arguments]).recipe
 
-    assert schedule() == {
-        "updates_per_step": 1, "updates_per_episode": 0, "batch_size": 256, "demo_batch_size": 256,
-    }  # fmt: skip
-    assert schedule("--policy.preset=paper_real_world")["updates_per_episode"] == 50
-    assert schedule("--policy.preset=paper_dmc_state")["demo_batch_size"] == 0
-    mixed = schedule("--policy.preset=paper_real_world", "--batch_size=8", "--updates_per_step=2")
-    assert mixed == {"updates_per_step": 2, "updates_per_episode": 50, "batch_size": 8, "demo_batch_size": 256}
+    assert recipe() == Recipe(1, 0, 256, 256, relabel=True, action_bounds="data")
+    assert recipe("--policy.preset=paper_real_world").updates_per_episode == 50
+    assert recipe("--policy.preset=paper_dmc_state").demo_batch_size == 0
+    mixed = recipe("--policy.preset=paper_real_world", "--batch_size=8", "--updates_per_step=2", "--relabel=false")
+    assert mixed == Recipe(2, 50, 8, 256, relabel=False)
+    # The paper's last table: DrQ-v2+ has the recipes of CQN, DrQ-v2 has not.
+    assert recipe(policy="drqv2") == Recipe()
+    plain = recipe("--policy.preset=drqv2", policy="drqv2")
+    assert plain == Recipe(1, 0, 512, 0, relabel=False, action_bounds="environment")
 
 
 def test_runs_are_checked() -> None:

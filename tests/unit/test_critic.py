@@ -52,7 +52,7 @@ def test_batch_size_does_not_change_the_action() -> None:
 
 
 def test_new_critic_explores_every_bin_and_is_deterministic_otherwise() -> None:
-    model = new_critic(levels=2, bins=3)
+    model = new_critic(levels=2, bins=3, exploration_noise=0.0)
     observation = Observation((), torch.randn(400, P))
     torch.manual_seed(0)
     explored, _ = model.act(observation, explore=True)
@@ -66,13 +66,24 @@ def test_new_critic_explores_every_bin_and_is_deterministic_otherwise() -> None:
 
 
 def test_exploring_keeps_clear_preferences() -> None:
-    model = build(0, P, 4)
+    model = build(0, P, 4, exploration_noise=0.0)
     observation = random_batch(model, 0, P).observation
     assert torch.equal(model.act(observation, explore=True)[0], model.act(observation)[0])
 
 
+def test_exploration_noise_has_its_size_and_leaves_representable_actions() -> None:
+    noisy = build(0, P, 4, exploration_noise=0.1)
+    observation = Observation((), torch.randn(2000, P * noisy.settings.frame_stack))
+    action, greedy = noisy.act(observation, explore=True)[0], noisy.act(observation)[0]
+    inside = greedy.abs() < 0.6
+    assert (action - greedy)[inside].std().item() == pytest.approx(0.1, rel=0.1)
+    s = noisy.settings
+    assert torch.equal(snap(action, s.levels, s.bins), action)
+    assert action.abs().max() <= 1
+
+
 def test_random_bins_can_be_switched_off() -> None:
-    model = new_critic(random_bin_below=0.0)
+    model = new_critic(random_bin_below=0.0, exploration_noise=0.0)
     assert len(model.act(Observation((), torch.randn(50, P)), explore=True)[0].unique()) == 1
 
 

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from lerobot_cqn.configuration_cqn import CQNConfig
 from lerobot_cqn.errors import DataError
-from lerobot_cqn.processor_cqn import make_cqn_pre_post_processors, scaling_stats
+from lerobot_cqn.processor_cqn import make_cqn_pre_post_processors
+from lerobot_cqn.processors import scaling_stats
 
 LOW, HIGH = [-1.0, 0.25, 2.0], [3.0, 0.25, 2.5]  # the middle dimension never moves
 STATS: dict[str, dict[str, Any]] = {

@@ -1,5 +1,6 @@
 """Lean off-screen rendering: renderers are made on first use, and closed without noise."""
 
+import atexit
 import weakref
 from typing import Any
 
@@ -17,8 +18,7 @@ class Cameras:
     def __init__(self, model: Any) -> None:
         self._model = model
         self._renderers: dict[tuple[int, int], Any] = {}
-        # At interpreter exit the graphics library may be gone before the renderers are: close them earlier.
-        self._closer = weakref.finalize(self, _close, self._renderers)
+        weakref.finalize(self, _close, self._renderers).atexit = False
 
     @property
     def opened(self) -> bool:
@@ -47,6 +47,9 @@ class Cameras:
         if key not in self._renderers:
             mujoco = load_mujoco()
             renderer = mujoco.Renderer(self._model, height, width)
+            if not self._renderers:
+                # Registered after the graphics library's own: what is registered last is called first.
+                atexit.register(_close, self._renderers)
             flags = mujoco.mjtRndFlag
             # Each costs a pass in software rendering and shows nothing here.
             for flag in (flags.mjRND_SHADOW, flags.mjRND_REFLECTION, flags.mjRND_SKYBOX, flags.mjRND_HAZE):

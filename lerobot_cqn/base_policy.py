@@ -1,0 +1,187 @@
+"""RLPolicy: the thin surface LeRobot's commands talk to, whatever the method."""
+
+import logging
+from collections import deque
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from torch import Tensor
+
+from .base_config import RLConfig
+from .errors import ConfigError, DataError
+from .model import Model
+from .schema import ACTION, NEXT_REWARD, Batch, Observation
+
+__all__ = ["RLPolicy"]
+
+logger = logging.getLogger(__name__)
+
+
+class RLPolicy(PreTrainedPolicy):
+    """A model with the history of its observations, and LeRobot's batches turned into n-step transitions.
+
+    A subclass names its configuration and model. dataset_meta (from lerobot-train) tells where episodes end, which the
+    batches do not say.
+    Raises ConfigError when features do not fit.
+    """
+
+    config_class = RLConfig  # LeRobot asks every class for these two; subclasses have their own
+    name = "rl"
+    model_class: ClassVar[Callable[..., Model]]
+    config: RLConfig
+    model: Model
+    episode_start: Tensor
+    episode_end: Tensor
+
+    def __init__(self, config: RLConfig, dataset_stats: Any = None, dataset_meta: Any = None, **_: Any) -> None:
+        super().__init__(config)
+        config.validate_features()
+        shapes = {key: feature.shape for key, feature in sorted(config.image_features.items())}
+        self.view_keys = tuple(shapes)
+        self.low_dim_keys = tuple(config.low_dim_features)
+        low_dim_size = sum(feature.shape[0] for feature in config.low_dim_features.values())
+        assert config.action_feature is not None  # noqa: S101  # validate_features has checked it
+        self.action_dims = config.action_feature.shape[0]
+        views = {key: (shape[0], shape[1], shape[2]) for key, shape in shapes.items()}
+        self.model = type(self).model_class(views, low_dim_size, self.action_dims, config.settings)
+        self._queue: deque[dict[str, Tensor]] = deque(maxlen=config.settings.frame_stack)
+        self._remember_episodes(dataset_meta)
+
+    def _remember_episodes(self, meta: Any) -> None:
+        """Keep the first and one-past-last global index of each episode; not part of the checkpoint."""
+        self.has_reward = meta is not None and NEXT_REWARD in meta.features
+        rows = ([], []) if meta is None else (meta.episodes["dataset_from_index"], meta.episodes["dataset_to_index"])
+        for name, row in zip(("episode_start", "episode_end"), rows, strict=True):
+            self.register_buffer(name, torch.as_tensor(list(row), dtype=torch.int64), persistent=False)
+        if meta is not None and not self.has_reward and self.config.settings.rl_loss_scale > 0:
+            logger.warning(
+                "The dataset has no '%s' column: the last step of each episode counts as the success (reward 1). "
+                "Drop failed episodes first, or label them.",
+                NEXT_REWARD,
+            )
+
+    # -- acting ----------------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Forget the frame history; call at the start of each episode."""
+        self._queue.clear()
+
+    def observe(self, batch: dict[str, Tensor]) -> Observation:
+        """Push one frame [B, ...] per feature and return the stacked history; the first frame is repeated.
+
+        Raises DataError when a feature the policy was trained on is missing or has another shape.
+        """
+        frame = {}
+        for key in (*self.view_keys, *self.low_dim_keys):
+            if key not in batch:
+                raise DataError(
+                    f"The observation lacks '{key}': expected {[*self.view_keys, *self.low_dim_keys]}, found "
+                    f"{sorted(k for k in batch if k.startswith('observation.'))}."
+                )
+            expected = (self.config.input_features or {})[key].shape
+            if tuple(batch[key].shape[1:]) != tuple(expected):
+                raise DataError(f"'{key}' has shape {tuple(batch[key].shape[1:])}, expected {tuple(expected)}.")
+            frame[key] = batch[key]
+        if not self._queue:
+            self._queue.extend([frame] * (self.config.settings.frame_stack - 1))
+        self._queue.append(frame)
+        return self.stack({key: torch.stack([past[key] for past in self._queue], dim=1) for key in frame})
+
+    def stack(self, frames: dict[str, Tensor]) -> Observation:
+        """Frames [B, S, ...] of each feature -> Observation (frames on the channels, low-dim concatenated)."""
+        views = tuple(frames[key].flatten(1, 2) for key in self.view_keys)
+        if not self.low_dim_keys:
+            return Observation(views)
+        low_dim = torch.cat([frames[key] for key in self.low_dim_keys], dim=-1)  # [B, S, P]
+        return Observation(views, low_dim.flatten(1))
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
+        """Deterministic action [B, D] in [-1, 1]."""
+        return self.model.act(self.observe(batch))[0]
+
+    @torch.no_grad()
+    def explore(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Action [B, D] in [-1, 1] with the method's exploration, and its Q [B]."""
+        return self.model.act(self.observe(batch), explore=True)
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """A chunk of one action, [B, 1, D]."""
+        return self.select_action(batch, **kwargs)[:, None]
+
+    # -- offline training by lerobot-train ---------------------------------------------------------------------
+
+    def get_optim_params(self) -> Any:
+        """Everything but the target networks, which follow by averaging."""
+        return [p for p in self.parameters() if p.requires_grad]
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """Loss of Algorithm 2 on a batch of LeRobot's data loader; every sample counts as a demonstration."""
+        data = self.to_batch(batch)
+        if self.training:
+            data = self.model.augment_batch(data)
+        loss, stats = self.model.loss(data)
+        return loss, {name: value.item() for name, value in stats.items() if name != "loss"}
+
+    def update(self) -> None:
+        """Polyak step; LeRobot calls it after each optimiser step."""
+        self.model.update_target()
+
+    def to_batch(self, batch: dict[str, Tensor]) -> Batch:
+        """n-step transitions from LeRobot's batch.
+
+        Past the end of an episode the loader repeats the last frame and its reward: rewards are masked, and
+        the repeated last observation stands in for the final one, which datasets do not store.
+        """
+        s = self.config.settings
+        deltas = self.config.observation_delta_indices
+        now = [deltas.index(index) for index in range(1 - s.frame_stack, 1)]
+        frames = {key: self._with_time(batch, key) for key in (*self.view_keys, *self.low_dim_keys)}
+        observation = self.stack({key: value[:, now] for key, value in frames.items()})
+        action = batch[ACTION].flatten(1, -2) if batch[ACTION].ndim == 2 else batch[ACTION][:, 0]
+        demo = torch.ones_like(action[:, :1])
+        if s.rl_loss_scale == 0:  # imitation only: rewards and next observations are not read
+            return Batch(observation, action, demo * 0, demo * 0, observation, demo)
+        reward, discount, window = self._n_step(batch, action)
+        # The stack that ends where the window does. An offset that was not loaded lies at the episode's end, where
+        # the last one, repeated, is the same frame.
+        loaded = [deltas.index(i) if i in deltas else -1 for i in range(1 - s.frame_stack, s.n_step + 1)]
+        row = torch.arange(len(action), device=action.device)[:, None]
+        later = torch.tensor(loaded, device=action.device)[window + torch.arange(s.frame_stack, device=action.device)]
+        next_observation = self.stack({key: value[row, later] for key, value in frames.items()})
+        return Batch(observation, action, reward, discount, next_observation, demo)
+
+    def _n_step(self, batch: dict[str, Tensor], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Discounted reward sum, bootstrap discount and length of the window in steps, all [B, 1]."""
+        if not len(self.episode_end):
+            raise ConfigError(
+                "The policy was made without a dataset and cannot tell where episodes end: make it with "
+                "`make_policy(cfg, ds_meta=...)`, or set `--policy.rl_loss_scale=0`."
+            )
+        s = self.config.settings
+        end = self.episode_end.to(like.device)[batch["episode_index"].flatten().long()]
+        remaining = (end - batch["index"].flatten().long())[:, None]  # steps to the end of the episode, >= 1
+        step = torch.arange(s.n_step, device=like.device)[None]
+        inside = step < remaining  # [B, n]
+        if self.has_reward:
+            rewards = batch[NEXT_REWARD].view(-1, s.n_step).to(like) * inside
+        else:
+            rewards = (step == remaining - 1).to(like)
+        reward = (rewards * s.discount**step).sum(-1, keepdim=True)
+        at_last = (remaining - 1).clamp(max=s.n_step - 1)
+        # A success is a real termination; an episode that ended without one only ran out of time.
+        terminal = (remaining <= s.n_step) & (rewards.gather(1, at_last) > 0)
+        window = remaining.clamp(max=s.n_step)
+        discount = s.discount ** window.to(like)
+        return reward, torch.where(terminal, torch.zeros_like(discount), discount), window
+
+    def _with_time(self, batch: dict[str, Tensor], key: str) -> Tensor:
+        if key not in batch:
+            raise DataError(
+                f"The batch lacks '{key}': found {sorted(k for k in batch if k.startswith('observation.'))}."
+            )
+        value = batch[key]
+        # With a single offset the loader drops the time axis of videos and vectors.
+        return value if value.ndim == len((self.config.input_features or {})[key].shape) + 2 else value[:, None]

@@ -1,0 +1,21 @@
+"""Pre- and post-processing of `--policy.type=drqv2`, under the name by which LeRobot looks for it."""
+
+from typing import Any
+
+from lerobot.processor import PolicyAction, PolicyProcessorPipeline
+
+from .configuration_drqv2 import DrQv2Config
+from .processors import Stats, make_processors
+
+__all__ = ["make_drqv2_pre_post_processors"]
+
+
+def make_drqv2_pre_post_processors(
+    config: DrQv2Config, dataset_stats: Stats | None = None, dataset_meta: Any | None = None
+) -> tuple[
+    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
+    PolicyProcessorPipeline[PolicyAction, PolicyAction],
+]:
+    """See `processors.make_processors`."""
+    del dataset_meta
+    return make_processors(config, dataset_stats)

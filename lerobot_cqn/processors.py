@@ -1,0 +1,141 @@
+"""Pre- and post-processing: LeRobot's steps with statistics that are safe online, and a bound on the state."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
+from lerobot.processor import (
+    AddBatchDimensionProcessorStep,
+    DeviceProcessorStep,
+    NormalizerProcessorStep,
+    ObservationProcessorStep,
+    PolicyAction,
+    PolicyProcessorPipeline,
+    ProcessorStepRegistry,
+    RenameObservationsProcessorStep,
+    UnnormalizerProcessorStep,
+)
+from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action
+from lerobot.utils.constants import (
+    ACTION,
+    OBS_ENV_STATE,
+    OBS_STATE,
+    POLICY_POSTPROCESSOR_DEFAULT_NAME,
+    POLICY_PREPROCESSOR_DEFAULT_NAME,
+)
+
+from .base_config import RLConfig
+from .errors import DataError
+from .schema import BOUND_PROCESSOR
+
+__all__ = ["BoundObservationProcessorStep", "Stats", "make_processors", "scaling_stats"]
+
+Stats = dict[str, dict[str, Any]]
+
+
+@ProcessorStepRegistry.register(name=BOUND_PROCESSOR)
+@dataclass
+class BoundObservationProcessorStep(ObservationProcessorStep):
+    """Cut normalised state to [-bound, bound]: a joint outside the demonstrations must not blow up the network.
+
+    Raises DataError for a state that is not finite.
+    """
+
+    bound: float = 2.0
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """Cut robot and environment state of an observation."""
+        bounded = dict(observation)
+        for key in (OBS_STATE, OBS_ENV_STATE):
+            if key in bounded:
+                value = torch.as_tensor(bounded[key])
+                if not torch.isfinite(value).all():
+                    raise DataError(
+                        f"'{key}' holds NaN or infinite values: expected finite numbers; check the sensor or the "
+                        "dataset (`cqn-data filter` names the episode and frame)."
+                    )
+                bounded[key] = value.clamp(-self.bound, self.bound)
+        return bounded
+
+    def get_config(self) -> dict[str, Any]:
+        """What is saved with the checkpoint."""
+        return {"bound": self.bound}
+
+    def transform_features(self, features: Any) -> Any:
+        """Shapes and types stay."""
+        return features
+
+
+def scaling_stats(stats: Stats, margin: float, *, inverse: bool) -> Stats:
+    """Statistics made safe for MIN_MAX scaling of state and action.
+
+    A constant dimension (min == max) maps to 0; with `inverse`, any value maps back to the constant.
+    margin widens the bounds of the action on both sides by this share of their range.
+    """
+    safe: Stats = {}
+    for key, entry in stats.items():
+        safe[key] = dict(entry)
+        if key not in (ACTION, OBS_STATE, OBS_ENV_STATE) or "min" not in entry:
+            continue
+        low, high = np.asarray(entry["min"], dtype=np.float64), np.asarray(entry["max"], dtype=np.float64)
+        widen = margin * (high - low) if key == ACTION else 0.0
+        constant = high - low <= 1e-8 * np.maximum(1.0, np.abs(low))
+        spread = np.where(constant, 0.0 if inverse else 1.0, widen)
+        safe[key]["min"], safe[key]["max"] = low - spread, high + spread
+        if inverse:  # exactly equal, so that LeRobot's inverse returns the constant
+            safe[key]["max"] = np.where(constant, safe[key]["min"], safe[key]["max"])
+    return safe
+
+
+def make_processors(
+    config: RLConfig, dataset_stats: Stats | None = None
+) -> tuple[
+    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
+    PolicyProcessorPipeline[PolicyAction, PolicyAction],
+]:
+    """Pipelines around the policy, under the step names LeRobot overrides by.
+
+    dataset_stats: LeRobot's statistics (`min`, `max`, `mean`, `std` per feature); None leaves values as they are.
+    """
+    stats = _tensors_to_numpy(dataset_stats or {})
+    margin = config.settings.action_margin
+    features: dict[str, PolicyFeature] = {**(config.input_features or {}), **(config.output_features or {})}
+    norm_map = {FeatureType(k): NormalizationMode(v) for k, v in config.normalization_mapping.items()}
+    pre = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]](
+        steps=[
+            RenameObservationsProcessorStep(rename_map={}),
+            AddBatchDimensionProcessorStep(),
+            DeviceProcessorStep(device=config.device),
+            NormalizerProcessorStep(
+                features=features,
+                norm_map=norm_map,
+                stats=scaling_stats(stats, margin, inverse=False),
+                device=config.device,
+            ),
+            BoundObservationProcessorStep(bound=config.settings.state_bound),
+        ],
+        name=POLICY_PREPROCESSOR_DEFAULT_NAME,
+    )
+    post = PolicyProcessorPipeline[PolicyAction, PolicyAction](
+        steps=[
+            UnnormalizerProcessorStep(
+                features=config.output_features or {},
+                norm_map=norm_map,
+                stats=scaling_stats(stats, margin, inverse=True),
+            ),
+            DeviceProcessorStep(device="cpu"),
+        ],
+        name=POLICY_POSTPROCESSOR_DEFAULT_NAME,
+        to_transition=policy_action_to_transition,
+        to_output=transition_to_policy_action,
+    )
+    return pre, post
+
+
+def _tensors_to_numpy(stats: Stats) -> Stats:
+    return {
+        key: {n: v.cpu().numpy() if isinstance(v, torch.Tensor) else v for n, v in entry.items()}
+        for key, entry in stats.items()
+    }
