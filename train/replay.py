@@ -151,6 +151,7 @@ class Replay:
                 f" --replay.capacity_gib={self._capacity_bytes / GIB:g}."
             )
         if self._journal is not None and self.folder is not None:
+            self.folder.mkdir(parents=True, exist_ok=True)
             if not (self.folder / "layout.json").is_file():
                 (self.folder / "layout.json").write_text(json.dumps(self._layout()))
             self._journal.announce(place.start, place.stop)
