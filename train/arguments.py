@@ -22,7 +22,7 @@ from lerobot_cqn.errors import ConfigError, CQNError, one_of
 from .checkpoint import last_checkpoint
 from .config import DatasetSettings, EvalSettings, RunConfig, WandBSettings
 
-__all__ = ["EXAMPLES", "parse"]
+__all__ = ["introduction", "parse"]
 
 logger = logging.getLogger(__name__)
 
@@ -37,10 +37,39 @@ Train a Coarse-to-fine Q-Network from demonstrations, then online.
   continue after Ctrl-C or a crash:          cqn-train --resume=true --output_dir=outputs/click
   start from a trained policy:               cqn-train --policy.path=outputs/click/checkpoints/last/pretrained_model ...
   imitation only (the paper's CBC):          cqn-train --policy.rl_loss_scale=0 --steps=0 --offline_updates=5000 ...
+  the paper's actor-critic baseline:         cqn-train --policy.type=drqv2 --policy.preset=drqv2_plus ...
+  without demonstrations:                    cqn-train --policy.preset=paper_dmc_state --env.type=dmc ...
   evaluate with LeRobot:                     lerobot-eval --policy.path=.../pretrained_model --env.type=ur5e_station
 
-Add --env.type=... or --policy.type=cqn before --help to see their options; --debug shows tracebacks.
+Presets (--policy.preset=NAME; every number can be replaced, docs/algorithm.md has them side by side):
 """
+
+PRESETS: dict[str, dict[str, str]] = {
+    "cqn": {
+        "paper_rlbench": "table 2 of the paper, RLBench: four cameras, an update a step (default)",
+        "paper_real_world": "table 2, real arm: 50 updates between episodes, stronger augmentation",
+        "paper_dmc_state": "the appendix on DeepMind Control, state, no demonstrations",
+        "paper_dmc_pixels": "the same, one camera",
+        "reference_rlbench": "the authors' implementation where it differs from the paper",
+        "laptop_state": "ours: joints and object poses, small network, minutes on one core",
+        "laptop_pixels": "ours: two small cameras, a laptop or one GPU",
+    },
+    "drqv2": {
+        "drqv2_plus": "the paper's DrQ-v2+: distributional critic, learns from demonstrations (default)",
+        "drqv2": "DrQ-v2 as published; demonstrations are experience like any other",
+    },
+}
+LAST = "Add --env.type=... or --policy.type=cqn before --help to see their options; --debug shows tracebacks.\n"
+
+
+def introduction() -> str:
+    """What `--help` begins with: examples, and the presets by name."""
+    lines = [
+        f"  --policy.type={policy:<6} {name:<18} {what}"
+        for policy, names in PRESETS.items()
+        for name, what in names.items()
+    ]
+    return "\n".join([EXAMPLES.rstrip(), *lines, "", LAST])
 
 
 def parse(arguments: Sequence[str]) -> RunConfig:

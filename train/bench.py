@@ -37,10 +37,11 @@ A plan is a YAML file:
     click_button: [--env.type=ur5e_station, --env.task=click_button, --dataset.repo_id=local/click_f,
                    --dataset.root=data/click_f]
   seeds: [1, 2, 3]
+  score: success_rate                                            # or mean_return, for tasks without success
 
-DIR/TASK/METHOD/SEED is a run as cqn-train leaves it; DIR/results.csv, results.md, aggregate.png and curves.png are made
-anew at the end (they need pip install 'lerobot_policy_cqn[bench]'). Ctrl-C stops all runs with their checkpoints; the
-same command continues.
+DIR/TASK/METHOD/SEED is a run as cqn-train leaves it; DIR/results.csv, results.md, table.png, aggregate.png, curves.csv
+and curves.png are made anew at the end (they need pip install 'lerobot_policy_cqn[bench]'). Ctrl-C stops all runs with
+their checkpoints; the same command continues.
 """
 STOPS_WITHIN_S = 60.0  # seconds that runs have to save after Ctrl-C
 
@@ -53,6 +54,12 @@ class Plan:
     tasks: Mapping[str, Sequence[str]]
     seeds: Sequence[int]
     common: Sequence[str] = ()
+    score: str = "success_rate"
+
+    @property
+    def digits(self) -> int:
+        """Decimals of a score in tables."""
+        return 2 if self.score == "success_rate" else 0
 
 
 @dataclass
@@ -108,14 +115,14 @@ def load_plan(path: Path) -> Plan:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
-    keys = ("common", "methods", "tasks", "seeds")
+    keys = ("common", "methods", "tasks", "seeds", "score")
     if not isinstance(content, Mapping):
         raise ConfigError(f"{path}: expected the keys {', '.join(keys)}.")
     for key in content:
         if key not in keys:
             raise ConfigError(f"{path}: " + one_of("key", str(key), keys))
     plan = Plan(content.get("methods") or {}, content.get("tasks") or {}, content.get("seeds") or [],
-                content.get("common") or [])  # fmt: skip
+                content.get("common") or [], content.get("score", "success_rate"))  # fmt: skip
     for name in ("methods", "tasks"):
         table: Any = getattr(plan, name)
         if not isinstance(table, Mapping) or not table or not all(_flags(flags) for flags in table.values()):
@@ -125,6 +132,8 @@ def load_plan(path: Path) -> Plan:
                 raise ConfigError(f"{path}: '{entry}' becomes a folder: expected letters, digits, '_', '-' and '.'.")
     if not _flags(plan.common):
         raise ConfigError(f"{path}: expected common as a list of --flag=value.")
+    if plan.score not in (valid := ("success_rate", "mean_return")):
+        raise ConfigError(f"{path}: " + one_of("score", str(plan.score), valid))
     if not plan.seeds or not all(isinstance(seed, int) and seed >= 0 for seed in plan.seeds):
         raise ConfigError(f"{path}: expected seeds as a list of whole numbers, got {plan.seeds}.")
     return plan
@@ -141,14 +150,14 @@ def runs_of(plan: Plan, folder: Path) -> list[Run]:
     return runs
 
 
-def work(runs: Sequence[Run], processes: int, console: Console) -> None:
+def work(runs: Sequence[Run], processes: int, console: Console, score: str = "success_rate") -> None:
     """Run all that are not done, `processes` at a time. Raises KeyboardInterrupt once all have stopped and saved."""
     for run in runs:
         run.state = "done" if run.done else "waiting"
     waiting = [run for run in runs if run.state != "done"]
     begun = time.monotonic()
     try:
-        with Live(_table(runs), console=console, refresh_per_second=1) as live:
+        with Live(_table(runs, score), console=console, refresh_per_second=1) as live:
             while waiting or any(run.process for run in runs):
                 running = [run for run in runs if run.process]
                 for run in waiting[: processes - len(running)]:
@@ -159,7 +168,7 @@ def work(runs: Sequence[Run], processes: int, console: Console) -> None:
                     run.look()
                     if run.state not in ("running", "done"):
                         console.print(f"{run.task} / {run.method} / {run.seed} {run.state}: see {run.folder}.log")
-                live.update(_table(runs, time.monotonic() - begun))
+                live.update(_table(runs, score, time.monotonic() - begun))
     except KeyboardInterrupt:
         console.print("Stopping: the runs are saving their checkpoints ...")
         _stop([run for run in runs if run.process])
@@ -180,16 +189,16 @@ def _stop(runs: Sequence[Run]) -> None:
                 run.process.wait()
 
 
-def _table(runs: Sequence[Run], seconds: float = 0.0) -> Table:
+def _table(runs: Sequence[Run], score: str, seconds: float = 0.0) -> Table:
     """Every run with its latest success rate; what is left of the time, judged by what is done."""
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("task", "method", "seed", "state", "step", "success"):
+    for name in ("task", "method", "seed", "state", "step", score.replace("_", " ")):
         table.add_column(name)
     for run in runs:
         rows = run.rows()
         last = rows[-1] if rows else {}
         table.add_row(run.task, run.method, str(run.seed), run.state, last.get("env_steps", ""),
-                      f"{float(last['success_rate']):.2f}" if last else "")  # fmt: skip
+                      f"{float(last[score]):.2f}" if last else "")  # fmt: skip
     done = sum(run.state == "done" for run in runs)
     table.caption = f"{done} of {len(runs)} done, {seconds / 60:.0f} min"
     return table
@@ -231,7 +240,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         plan = load_plan(Path(arguments[0]))
         runs = runs_of(plan, folder)
         if "report_only" not in options:
-            work(runs, int(processes), console)
+            work(runs, int(processes), console, plan.score)
         write_report(plan, runs, folder, console)
     except KeyboardInterrupt:
         console.print("Stopped; the same command continues.")

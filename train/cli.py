@@ -32,7 +32,7 @@ from lerobot_cqn.learner import Learner
 
 from . import envs  # noqa: F401  # registers our environments
 from .agent import Agent
-from .arguments import EXAMPLES, parse
+from .arguments import introduction, parse
 from .checkpoint import Counters, last_checkpoint, restore, save, seed_everything
 from .config import RunConfig
 from .console import ConsoleMonitor
@@ -66,7 +66,7 @@ def build(config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], 
     s = config.policy.settings
     scenes: Scenes = OneScene(env)
     if config.eval.batch_size > 1:
-        scenes = GymScenes(config.env, config.policy, config.eval.batch_size)
+        scenes = GymScenes(config.env, config.policy, config.eval.batch_size, apart=config.eval.use_async_envs)
     replay = Replay(
         s.frame_stack, s.n_step, s.discount, folder=config.output_dir / "replay",
         capacity_gib=config.replay.capacity_gib, by_step=config.replay.sampling == "steps",
@@ -220,7 +220,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     set_up_logging(debug)
     register_third_party_plugins()
     if not arguments or "-h" in arguments or "--help" in arguments:
-        print(EXAMPLES)  # noqa: T201
+        print(introduction())  # noqa: T201
         parser.print_scoped_help(RunConfig, arguments)
         return 0
     try:

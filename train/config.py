@@ -59,7 +59,8 @@ class EvalSettings:
     freq: int = 1000  # environment steps between evaluations; 0: only after the offline phase and at the end
     n_episodes: int = 20  # of each evaluation on the way
     final_n_episodes: int = 50  # after the offline phase and at the end
-    batch_size: int = 1  # episodes at a time, in processes of their own where there is more than one
+    batch_size: int = 1  # episodes at a time, for one batch of actions
+    use_async_envs: bool = False  # each in a process of its own: worth it with cameras and several cores
     videos: int = 0  # films of the first episodes of each evaluation, in output_dir/videos
 
 

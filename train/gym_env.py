@@ -25,9 +25,11 @@ NEW_EPISODE = {"lerobot_new_rollout": True}  # as lerobot-eval marks a reset
 class _Gym:
     """Environments made by LeRobot's factory, with LeRobot's observation names and processors."""
 
-    def __init__(self, config: EnvConfig, policy_config: PreTrainedConfig, count: int = 1) -> None:
+    def __init__(
+        self, config: EnvConfig, policy_config: PreTrainedConfig, count: int = 1, *, apart: bool = False
+    ) -> None:
         try:
-            suites = make_env(config, n_envs=count, use_async_envs=count > 1)
+            suites = make_env(config, n_envs=count, use_async_envs=apart)
         except ImportError as error:
             raise ConfigError(f"The environment '{config.type}' is not installed: {error}") from error
         vectors = [vector for tasks in suites.values() for vector in tasks.values()]
@@ -55,7 +57,7 @@ class GymEnvironment(_Gym):
     """One environment, stepped by itself. Raises ConfigError where it is not installed, DataError for several tasks."""
 
     def __init__(self, config: EnvConfig, policy_config: PreTrainedConfig) -> None:
-        super().__init__(config, policy_config)
+        super().__init__(config, policy_config, 1, apart=False)
         self.env: gym.Env[Any, Any] = self.vector.envs[0]
         self._fps = int(config.fps)
 
@@ -93,16 +95,16 @@ class GymEnvironment(_Gym):
 
 
 class GymScenes(_Gym):
-    """K > 1 environments of one kind, each in a process of its own. Raises what `GymEnvironment` does."""
+    """K environments of one kind; apart: each in a process of its own. Raises what `GymEnvironment` does."""
 
-    def __init__(self, config: EnvConfig, policy_config: PreTrainedConfig, count: int) -> None:
-        super().__init__(config, policy_config, count)
+    def __init__(self, config: EnvConfig, policy_config: PreTrainedConfig, count: int, *, apart: bool = False) -> None:
+        super().__init__(config, policy_config, count, apart=apart)
         self.count = count
 
     @property
     def max_steps(self) -> int:
         """Control steps before an episode is cut off."""
-        return int(self.vector.call("_max_episode_steps")[0])
+        return int(self.vector.get_attr("_max_episode_steps")[0])
 
     def reset(self, seeds: Sequence[int]) -> Frame:
         """Start an episode in each; rows [K, ...]."""

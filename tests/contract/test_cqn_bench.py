@@ -53,8 +53,12 @@ def test_runs_once_continues_what_was_killed_and_reports(plan: Path, tmp_path: P
     assert {(r["task"], r["method"], r["seed"], r["n"]) for r in rows} == {
         ("click", m, "1", "2") for m in ("cqn", "cbc")
     }
-    for name in ("aggregate.png", "curves.png"):
+    for name in ("table.png", "aggregate.png", "curves.png"):
         assert Image.open(out / name).width > 300
+    with (out / "curves.csv").open() as file:
+        curves = list(csv.DictReader(file))
+    ends = {(r["method"], r["mean"]) for r in curves if r["env_steps"] == curves[-1]["env_steps"]}
+    assert ends == {(r["method"], f"{float(r['success_rate']):.4f}") for r in rows}
     assert "| cbc |" in (out / "results.md").read_text()
     assert main([str(plan), f"--output_dir={out}"]) == 0  # nothing is left to do
     assert stamps == {p: p.stat().st_mtime_ns for p in out.rglob("evaluations.csv")}
@@ -81,6 +85,7 @@ def test_a_failed_run_is_named_and_the_others_go_on(
         ("methods: {a: [--x=1]}\nseeds: [1]", "expected tasks as NAME"),
         ("method: {a: []}", "Did you mean 'methods'?"),
         ("methods: {../a: [--x=1]}\ntasks: {t: [--y=1]}\nseeds: [1]", "becomes a folder"),
+        ("methods: {a: [--x=1]}\ntasks: {t: [--y=1]}\nseeds: [1]\nscore: sucess_rate", "Did you mean 'success_rate'?"),
         ("[", "is not YAML"),
         ("- 1", "expected the keys"),
     ],

@@ -116,10 +116,11 @@ def station() -> EnvConfig:
     return make_env_config("ur5e_station", obs_type="state", episode_length=12)
 
 
-def test_episodes_evaluated_together_are_those_evaluated_one_by_one(plus: Path) -> None:
+@pytest.mark.parametrize("apart", [False, True], ids=["one process", "processes"])
+def test_episodes_evaluated_together_are_those_evaluated_one_by_one(plus: Path, apart: bool) -> None:
     agent = load(plus / "checkpoints/last/pretrained_model")
     env = GymEnvironment(station(), agent.policy.config)
-    together = GymScenes(station(), agent.policy.config, 3)
+    together = GymScenes(station(), agent.policy.config, 3, apart=apart)
     try:
         one = evaluate(agent, OneScene(env), 5, film=2)
         several = evaluate(agent, together, 5, film=2)

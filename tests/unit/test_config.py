@@ -175,3 +175,13 @@ def test_runs_are_checked() -> None:
     for option in ("save_freq", "log_freq"):
         with pytest.raises(ConfigError, match=f"`{option}` must be at least 1, got 0"):
             validate(f"--{option}=0")
+
+
+def test_help_names_every_preset() -> None:
+    from cqn_train.arguments import introduction
+    from lerobot_cqn.settings import DRQV2_PRESETS
+
+    lines = introduction().splitlines()
+    for policy, presets in (("cqn", PRESETS), ("drqv2", DRQV2_PRESETS)):
+        shown = [line.split()[1] for line in lines if line.strip().startswith(f"--policy.type={policy} ")]
+        assert sorted(shown) == sorted(presets)
