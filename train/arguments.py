@@ -74,7 +74,7 @@ def introduction() -> str:
 
 def parse(arguments: Sequence[str]) -> RunConfig:
     """Run settings from the command line. Raises ConfigError for anything that does not parse."""
-    arguments = list(arguments)
+    arguments = _with_plugins(arguments)
     config_file: str | None = None
     if _flag(arguments, "resume"):
         output_dir = parser.parse_arg("output_dir", arguments)
@@ -109,6 +109,18 @@ def parse(arguments: Sequence[str]) -> RunConfig:
     if wanted and config.policy and config.policy.device != wanted:
         logger.warning("The device '%s' is not available: using '%s'.", wanted, config.policy.device)
     return config
+
+
+def _with_plugins(arguments: Sequence[str]) -> list[str]:
+    """The arguments without `--env.discover_packages_path=PACKAGE`, whose packages have registered what they hold."""
+    rest = list(arguments)
+    for flag, package in parser.parse_plugin_args(parser.PLUGIN_DISCOVERY_SUFFIX, rest).items():
+        try:
+            parser.load_plugin(package)
+        except parser.PluginLoadError as error:
+            raise ConfigError(f"--{flag}={package}: {error}") from error
+        rest = parser.filter_arg(flag, rest)
+    return rest
 
 
 def _pretrained_config(path: str, overrides: list[str]) -> PreTrainedConfig:

@@ -1,0 +1,167 @@
+"""gym_aloha with sparse reward and small, fast pictures."""
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from lerobot_cqn.errors import ConfigError
+
+from .aloha_config import FPS, JOINTS, TASKS, check_settings
+from .cameras import Cameras
+from .common import RENDER_SIZE, checked_action, dict_space, make_lean
+from .simulator import load_mujoco
+
+__all__ = ["Aloha"]
+
+_STAGES = 4  # gym_aloha's highest reward
+_LIMIT = 3.2  # rad; no joint turns further
+_POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+
+Observation = dict[str, Any]
+
+
+class Aloha(gym.Env[Observation, NDArray[np.float32]]):
+    """Two ViperX arms over a table, in MuJoCo at 50 Hz; physics, start and stages are gym_aloha's own.
+
+    Action, (14,) float32: for the left and then the right arm six absolute joint angles in rad and the gripper,
+    0 (closed) to 1 (open). Values out of -3.2 to 3.2 are clipped.
+
+    Observation:
+        agent_pos: (14,) float32, the same numbers measured.
+        environment_state: (7,) float32 an object, position in m and quaternion; not with "pixels".
+        pixels: one (image_size, image_size, 3) uint8 a camera, a 4:3 view squeezed to a square; not with "state".
+
+    Success is gym_aloha's last stage, the cube off the table in the left gripper or the peg in the socket; it ends the
+    episode. Reward "sparse": 1 on success, else 0; "dense": the present stage, 0 to 1 in quarters.
+    `info["is_success"]` is always present, after a step `info["stage"]`, 0 to 4, too.
+
+    Attributes:
+        task, task_description: name of the task, and the sentence that instructs it.
+        state_names, action_names, environment_state_names: of the numbers above.
+        action_kind: "command": each action stands for itself, so that leaving steps out changes no other.
+    """
+
+    action_kind: ClassVar[str] = "command"
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": FPS}
+
+    def __init__(
+        self,
+        task: str = "transfer_cube",
+        obs_type: str = "pixels",
+        cameras: list[str] | tuple[str, ...] = ("top",),
+        image_size: int = 84,
+        reward: str = "sparse",
+        render_mode: str | None = "rgb_array",
+    ) -> None:
+        """Build the scene; no graphics context is opened before the first picture.
+
+        Raises:
+            ConfigError: an unknown task, obs_type, camera or reward, a size out of range, or gym_aloha is missing.
+        """
+        check_settings(task, obs_type, cameras, image_size, reward)
+        objects = TASKS[task].objects
+        self._simulator, self._diverged = _simulator(task)
+        self._native_task, physics = self._simulator._env.task, self._simulator._env.physics
+        # Its own observation draws three cameras at 480x640, whatever was asked for.
+        self._native_task.get_observation = self._numbers
+        self._data = physics.data.ptr
+        model = physics.model.ptr
+        make_lean(model, _picture_size(image_size)[1])
+        self._cameras = Cameras(model)
+        self._camera_names = tuple(cameras) if obs_type != "state" else ()
+        self._image_size = image_size
+        self._with_state = obs_type != "pixels"
+        self._dense = reward == "dense"
+        self._last: Observation = {}
+        self.render_mode = render_mode
+        self.fps = FPS
+        self.task = task
+        self.task_description = TASKS[task].description
+        self.state_names = list(JOINTS)
+        self.action_names = list(JOINTS)
+        self.environment_state_names = [f"{name}.{part}" for name in objects for part in _POSE]
+        self.action_space = gym.spaces.Box(-_LIMIT, _LIMIT, (len(JOINTS),), np.float32)
+        states = len(self.environment_state_names) if self._with_state else 0
+        self.observation_space = dict_space(len(JOINTS), states, self._camera_names, image_size)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode; the same `seed` gives gym_aloha's episode of that seed, without one the stream goes on.
+
+        `options` is accepted for callers that pass marks of their own; none changes anything.
+        """
+        super().reset(seed=seed)
+        chosen = int(self.np_random.integers(2**31)) if seed is None else seed
+        observation, _ = self._simulator.reset(seed=chosen)
+        self._last = self._observe(observation)
+        return self._last, {"is_success": False}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Apply one action for 0.02 s. A simulation that diverges ends the episode as a failure.
+
+        Raises:
+            DataError: the action is not fourteen finite numbers.
+        """
+        checked = checked_action(action, self.action_space, self.action_names)
+        try:
+            observation, stage, _, _, _ = self._simulator.step(checked)
+        except self._diverged:
+            return self._last, 0.0, True, False, {"is_success": False, "stage": 0}
+        success = bool(stage == _STAGES)
+        reward = stage / _STAGES if self._dense else float(success)
+        self._last = self._observe(observation)
+        return self._last, float(reward), success, False, {"is_success": success, "stage": int(stage)}
+
+    def render(self) -> NDArray[np.uint8]:
+        """The table from above, (360, 480, 3) uint8 RGB."""
+        return self._cameras.picture(self._data, "top", *RENDER_SIZE)
+
+    def close(self) -> None:
+        """Release graphics contexts; calling it twice is harmless."""
+        self._cameras.close()
+
+    def _numbers(self, physics: Any) -> dict[str, Any]:
+        """What gym_aloha reads from its task after a step, without its pictures."""
+        return {
+            "qpos": self._native_task.get_qpos(physics),
+            "env_state": self._native_task.get_env_state(physics),
+            "images": {"top": np.zeros(0)},
+        }
+
+    def _observe(self, native: dict[str, Any]) -> Observation:
+        observation: Observation = {"agent_pos": np.asarray(native["agent_pos"], np.float32)}
+        if self._with_state:
+            poses = self._native_task.get_env_state(self._simulator._env.physics)
+            observation["environment_state"] = np.asarray(poses, np.float32)
+        if self._camera_names:
+            observation["pixels"] = {name: self._picture(name) for name in self._camera_names}
+        return observation
+
+    def _picture(self, camera: str) -> NDArray[np.uint8]:
+        """What `cqn-data resize` makes of the public datasets' 480x640: the same view, squeezed."""
+        size = self._image_size
+        wide = self._cameras.picture(self._data, camera, *_picture_size(size))
+        return np.asarray(Image.fromarray(wide).resize((size, size), Image.Resampling.BOX))
+
+
+def _picture_size(image_size: int) -> tuple[int, int]:
+    """Height and width of the 4:3 picture that is drawn: twice as fine, since smoothing by hand costs least."""
+    return 2 * image_size, 8 * image_size // 3
+
+
+def _simulator(task: str) -> tuple[Any, type[Exception]]:
+    """gym_aloha's environment of a task, and what it raises when the simulation diverges."""
+    try:
+        load_mujoco()
+        from dm_control.rl.control import PhysicsError
+        from gym_aloha.env import AlohaEnv
+    except (ImportError, ConfigError) as error:
+        raise ConfigError(
+            "The environment 'aloha_small' needs gym_aloha, which is not installed: "
+            "run `pip install 'lerobot_policy_cqn[aloha]'`."
+        ) from error
+    return AlohaEnv(task=task, obs_type="pixels_agent_pos"), PhysicsError

@@ -1,0 +1,124 @@
+"""A scripted operator for gym_hil's tasks: steers through the same four values as any policy, and pauses."""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_cqn.errors import ConfigError
+
+from .hil import STEP
+
+if TYPE_CHECKING:
+    from .hil import HilSim
+
+__all__ = ["HilTeleoperator"]
+
+_PAUSE_STEPS = (3, 15)  # shortest and longest hesitation, control steps
+_MEAN_PAUSE = sum(_PAUSE_STEPS) / 2
+_MOVES = 18  # steps without pauses to pick up one object, about
+_OVER = np.array([0.0, 0.0, 0.09])  # m, from an object to where the tool lines up
+_ALIGNED = 0.012  # m, near enough across the floor to go down
+_CARRY = 0.1  # m, height at which a box is carried
+_HELD = 0.035  # m between tool and object in a closed gripper
+_UP = np.array([0.0, 0.0, STEP])  # m, one step
+
+
+class Goal(NamedTuple):
+    """Where the tool's target shall go, (3,) m, the gripper's closure, and a moment at which a person would stop."""
+
+    target: NDArray[np.float64]
+    closure: float
+    moment: str = ""
+
+
+class HilTeleoperator:
+    """Goes over an object, down, grasps, lifts, and in `arrange_boxes` carries it to its field.
+
+    While moving, the action depends on the present state alone. While pausing it is a zero movement with the gripper
+    as it was. Pauses come at the start, before grasping and at random.
+
+    Attributes:
+        pausing: whether the last `act` was a pause.
+    """
+
+    pausing: bool
+
+    def __init__(self, env: "HilSim", pause_share: float = 0.0, seed: int = 0) -> None:
+        """Steer `env` (unwrapped).
+
+        Args:
+            env: the environment, which the caller steps.
+            pause_share: expected share of still steps, [0, 0.9].
+            seed: of the pauses, until `reset` gives another.
+
+        Raises:
+            ConfigError: a value out of range.
+        """
+        if not 0.0 <= pause_share <= 0.9:
+            raise ConfigError(f"pause_share is {pause_share}: expected 0 to 0.9.")
+        self._env = env
+        still_per_move = pause_share / (1.0 - pause_share)
+        self._natural = min(1.0, still_per_move)  # probability of a pause at the start and before a grasp
+        moves = _MOVES * len(env.objects)
+        expected = (1 + len(env.objects)) * self._natural * _MEAN_PAUSE / moves
+        self._hazard = float(np.clip((still_per_move - expected) / _MEAN_PAUSE, 0.0, 1.0))
+        self.reset(seed)
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode; call it after the environment's reset. The same seed gives the same pauses."""
+        self._rng = np.random.default_rng(seed)
+        self._left = self._pause() if self._rng.random() < self._natural else 0
+        self._hesitated: set[str] = set()
+        self.pausing = False
+
+    def act(self) -> NDArray[np.float32]:
+        """Action for the present state, (4,) float32 within the action space."""
+        goal = self._goal()
+        if self._left == 0:
+            if goal.moment and goal.moment not in self._hesitated:
+                self._hesitated.add(goal.moment)
+                self._left = self._pause() if self._rng.random() < self._natural else 0
+            elif self._rng.random() < self._hazard:
+                self._left = self._pause()
+        self.pausing = self._left > 0
+        if self.pausing:
+            self._left -= 1
+            goal = Goal(self._env.target, round(self._env.closure))
+        move = np.clip((goal.target - self._env.target) / STEP, -1.0, 1.0)
+        return np.append(move, goal.closure).astype(np.float32)
+
+    def _pause(self) -> int:
+        return int(self._rng.integers(_PAUSE_STEPS[0], _PAUSE_STEPS[1] + 1))
+
+    def _goal(self) -> Goal:
+        env = self._env
+        for name in env.objects:
+            field = env.place(name.replace("block", "target")) if len(env.objects) > 1 else None
+            held = env.closure > 0.5 and float(np.linalg.norm(env.place(name) - env.tip)) < _HELD
+            if held:
+                return self._carry(name, field)
+            if field is None or float(np.linalg.norm((env.place(name) - field)[:2])) > 0.02:
+                return self._reach(name)
+        return Goal(env.target + _UP, 0.0)  # all is done: out of the way
+
+    def _reach(self, name: str) -> Goal:
+        place, tip = self._env.place(name), self._env.tip
+        offset = float(np.linalg.norm((place - tip)[:2]))
+        if offset > _ALIGNED and not (offset < 2 * _ALIGNED and tip[2] - place[2] < 0.06):
+            return Goal(place + _OVER, 0.0)
+        if tip[2] - place[2] > _ALIGNED:
+            return Goal(place, 0.0, f"grasp {name}" if tip[2] - place[2] < 0.03 else "")
+        return Goal(self._env.target, 1.0)
+
+    def _carry(self, name: str, field: NDArray[np.float64] | None) -> Goal:
+        place, target = self._env.place(name), self._env.target
+        if field is None:
+            return Goal(target + _UP, 1.0)
+        across = target + (field - place) * [1.0, 1.0, 0.0]
+        if float(np.linalg.norm((field - place)[:2])) > _ALIGNED:
+            low = place[2] < _CARRY - 0.03
+            return Goal(target + _UP if low else np.append(across[:2], _CARRY), 1.0)
+        if place[2] > 0.03:
+            return Goal(np.append(across[:2], 0.02), 1.0)
+        return Goal(target, 0.0)

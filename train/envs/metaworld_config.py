@@ -1,0 +1,183 @@
+"""How LeRobot finds Meta-World with sparse rewards: `--env.type=metaworld_sparse`. No simulator is imported here."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+from lerobot.envs.configs import EnvConfig
+
+from lerobot_cqn.errors import ConfigError, one_of
+
+from .env_config import SimEnvConfig, Sizes, check_cameras
+
+__all__ = [
+    "CAMERAS",
+    "DEFAULT_CAMERAS",
+    "HORIZON_S",
+    "SIMULATOR_HZ",
+    "TASKS",
+    "MetaworldSparseEnv",
+    "canonical_task",
+    "check_settings",
+    "gym_id",
+    "state_size",
+]
+
+CAMERAS = ("corner", "corner2", "corner3", "topview", "behindGripper", "gripperPOV")
+DEFAULT_CAMERAS = ("corner2", "gripperPOV")
+SIMULATOR_HZ = 80  # Meta-World's own control rate
+RATES = (10, 20, 40, 80)
+HORIZON_S = 5  # seconds before an episode is cut off: 100 steps at 20 Hz
+_VERSION = "-v3"
+
+# Task without its version, and the sentence that instructs it.
+TASKS = {
+    "assembly": "Put the ring over the peg",
+    "basketball": "Drop the ball through the hoop",
+    "bin-picking": "Move the cube into the other bin",
+    "box-close": "Put the lid on the box",
+    "button-press": "Push the button on the wall",
+    "button-press-topdown": "Push the button down from above",
+    "button-press-topdown-wall": "Push the button down from above, over the wall",
+    "button-press-wall": "Push the button behind the wall",
+    "coffee-button": "Push the button of the coffee machine",
+    "coffee-pull": "Pull the mug away from the coffee machine",
+    "coffee-push": "Push the mug under the coffee machine",
+    "dial-turn": "Turn the dial",
+    "disassemble": "Take the ring off the peg",
+    "door-close": "Close the door",
+    "door-lock": "Lock the door",
+    "door-open": "Open the door",
+    "door-unlock": "Unlock the door",
+    "drawer-close": "Close the drawer",
+    "drawer-open": "Open the drawer",
+    "faucet-close": "Turn the faucet off",
+    "faucet-open": "Turn the faucet on",
+    "hammer": "Drive the nail in with the hammer",
+    "hand-insert": "Put the hand into the hole",
+    "handle-press": "Press the handle down",
+    "handle-press-side": "Press the handle down from the side",
+    "handle-pull": "Pull the handle up",
+    "handle-pull-side": "Pull the handle up from the side",
+    "lever-pull": "Pull the lever up",
+    "peg-insert-side": "Put the peg into the hole in the side of the box",
+    "peg-unplug-side": "Pull the peg out of the side of the box",
+    "pick-out-of-hole": "Take the puck out of the hole",
+    "pick-place": "Carry the puck to the goal",
+    "pick-place-wall": "Carry the puck over the wall to the goal",
+    "plate-slide": "Slide the plate into the goal",
+    "plate-slide-back": "Slide the plate back out of the goal",
+    "plate-slide-back-side": "Slide the plate sideways out of the goal",
+    "plate-slide-side": "Slide the plate sideways into the goal",
+    "push": "Push the puck to the goal",
+    "push-back": "Pull the puck back to the goal",
+    "push-wall": "Push the puck around the wall to the goal",
+    "reach": "Move the hand to the goal",
+    "reach-wall": "Move the hand over the wall to the goal",
+    "shelf-place": "Put the block on the shelf",
+    "soccer": "Push the ball into the net",
+    "stick-pull": "Pull the box with the stick",
+    "stick-push": "Push the box with the stick",
+    "sweep": "Sweep the block off the table",
+    "sweep-into": "Sweep the block into the hole",
+    "window-close": "Slide the window shut",
+    "window-open": "Slide the window open",
+}
+_TWO_OBJECTS = ("hammer", "stick-pull", "stick-push")
+
+
+def canonical_task(task: str) -> str:
+    """Meta-World's name of a task given with or without its version: "drawer-open" is "drawer-open-v3".
+
+    Raises:
+        ConfigError: there is no such task.
+    """
+    name = task.removesuffix(_VERSION)
+    if name not in TASKS:
+        raise ConfigError(one_of("Meta-World task", name, TASKS))
+    return name + _VERSION
+
+
+def state_size(task: str) -> int:
+    """Numbers in `environment_state`: a pose of seven for each object, and the goal's three."""
+    return (14 if task.removesuffix(_VERSION) in _TWO_OBJECTS else 7) + 3
+
+
+def check_settings(task: str, obs_type: str, cameras: list[str] | tuple[str, ...], image_size: int, fps: int) -> None:
+    """Validate what a user may set.
+
+    Raises:
+        ConfigError: an unknown task, obs_type or camera, none or a repeated camera, or a number out of range.
+    """
+    canonical_task(task)
+    check_cameras(obs_type, cameras, CAMERAS, image_size)
+    if fps not in RATES:
+        raise ConfigError(f"fps is {fps}: expected 10, 20, 40 or 80 (whole steps of Meta-World's 80 Hz).")
+
+
+def gym_id(task: str) -> str:
+    """Name under which gymnasium knows a task, given with or without its version."""
+    return f"cqn_metaworld/{canonical_task(task)}"
+
+
+for _task in TASKS:
+    if gym_id(_task) not in gym.registry:
+        gym.register(
+            gym_id(_task),
+            # As text: the module is imported when an environment is made.
+            entry_point=f"{__package__}.metaworld:MetaworldSparse",
+            kwargs={"task": _task},
+            max_episode_steps=HORIZON_S * 20,
+        )
+
+
+@EnvConfig.register_subclass("metaworld_sparse")
+@dataclass
+class MetaworldSparseEnv(SimEnvConfig):
+    """A task of Meta-World (MT1, objects placed anew in each episode): success gives the only reward and is the end.
+
+    Attributes:
+        task: one of Meta-World's 50, with or without "-v3", e.g. drawer-open; kept with it.
+        fps: control steps a second: 10, 20, 40 or 80; at 20 an action is held for 4 simulator steps.
+        episode_length: control steps before the episode is cut off; None: 5 seconds, 100 steps at 20 Hz.
+        obs_type: "state" (hand, objects and goal), "pixels" (hand and cameras) or "both".
+        cameras: which of corner, corner2, corner3, topview, behindGripper, gripperPOV; unused with "state".
+        The others are those of `SimEnvConfig`.
+
+    Raises:
+        ConfigError: a value that is not one of those named above, or a given feature of another shape.
+    """
+
+    task: str | None = "drawer-open-v3"
+    fps: int = 20
+    cameras: list[str] = field(default_factory=lambda: list(DEFAULT_CAMERAS))
+
+    def check(self) -> None:
+        """Validate what a user may set; completes the task's name."""
+        check_settings(self.task or "", self.obs_type, self.cameras, self.image_size, self.fps)
+        self.task = canonical_task(str(self.task))
+
+    @property
+    def sizes(self) -> Sizes:
+        """Hand and gripper, twice, and objects with the goal."""
+        return Sizes(4, 4, 0 if self.obs_type == "pixels" else state_size(str(self.task)))
+
+    @property
+    def package_name(self) -> str:
+        """Module whose import registers the environment with gymnasium."""
+        return __name__
+
+    @property
+    def gym_id(self) -> str:
+        """Name of the environment in gymnasium's registry."""
+        return gym_id(str(self.task))
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Control steps before an episode is cut off."""
+        return HORIZON_S * self.fps if self.episode_length is None else self.episode_length
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Arguments of `gymnasium.make`."""
+        return {**super().gym_kwargs, "fps": self.fps}

@@ -1,0 +1,107 @@
+"""How LeRobot finds gym_pusht at the declared picture size: `--env.type=pusht_small`. Imports no simulator."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.constants import OBS_IMAGE
+
+from lerobot_cqn.errors import ConfigError, one_of
+
+from .env_config import SimEnvConfig, Sizes, check_cameras
+
+__all__ = ["FPS", "KEYPOINTS", "REWARDS", "PushtSmallEnv", "check_settings"]
+
+FPS = 10
+KEYPOINTS = 16  # numbers: x and y of eight corners
+LIMIT = 300  # steps, gym_pusht's own
+REWARDS = ("sparse", "dense")
+GYM_ID = "cqn_pusht/PushT-v0"
+
+if GYM_ID not in gym.registry:
+    # As text: the module is imported when an environment is made.
+    gym.register(GYM_ID, entry_point=f"{__package__}.pusht:PushT", max_episode_steps=LIMIT)
+
+
+def check_settings(obs_type: str, image_size: int, reward: str) -> None:
+    """Validate what a user may set. Raises ConfigError."""
+    check_cameras(obs_type, ("scene",), ("scene",), image_size)
+    if reward not in REWARDS:
+        raise ConfigError(one_of("reward", reward, REWARDS))
+
+
+@EnvConfig.register_subclass("pusht_small")
+@dataclass
+class PushtSmallEnv(SimEnvConfig):
+    """gym_pusht: push a T onto a drawn one. Its features are those of the public dataset `lerobot/pusht`.
+
+    LeRobot's own type `pusht` declares pictures of 384 pixels and delivers 96; this one delivers what it declares.
+
+    Attributes:
+        task: "pusht".
+        fps: control steps a second, 10.
+        episode_length: control steps before the episode is cut off; None: 300.
+        obs_type: "pixels" (disc and picture, as in `lerobot/pusht`), "state" (disc and the T's corners) or "both".
+        cameras: unused; the one picture is `observation.image`.
+        image_size: height and width of the picture, 96 in `lerobot/pusht`.
+        reward: "sparse" (1 on success) or "dense" (covered share, 0 to 1).
+        The others are those of `SimEnvConfig`.
+
+    Raises:
+        ConfigError: a value that is not one of those named above, or a given feature of another shape.
+    """
+
+    task: str | None = "pusht"
+    fps: int = FPS
+    obs_type: str = "pixels"
+    image_size: int = 96
+    reward: str = "sparse"
+
+    def check(self) -> None:
+        """Validate what a user may set. Raises ConfigError."""
+        check_settings(self.obs_type, self.image_size, self.reward)
+        if self.task != "pusht":
+            raise ConfigError(one_of("task", str(self.task), ("pusht",)))
+        if self.fps != FPS:
+            raise ConfigError(f"fps is {self.fps}: expected {FPS}, gym_pusht's own.")
+
+    @property
+    def sizes(self) -> Sizes:
+        """Place of the disc, twice, and the T's corners."""
+        return Sizes(2, 2, 0 if self.obs_type == "pixels" else KEYPOINTS)
+
+    @property
+    def package_name(self) -> str:
+        """Module whose import registers the environment with gymnasium."""
+        return __name__
+
+    @property
+    def gym_id(self) -> str:
+        """Name of the environment in gymnasium's registry."""
+        return GYM_ID
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Control steps before an episode is cut off."""
+        return self.episode_length or LIMIT
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Arguments of `gymnasium.make`."""
+        kwargs = super().gym_kwargs
+        del kwargs["cameras"]
+        return {**kwargs, "reward": self.reward}
+
+    @property
+    def shown_cameras(self) -> list[str]:
+        """None with a name."""
+        return []
+
+    def _derived(self) -> dict[str, tuple[PolicyFeature, str]]:
+        derived = super()._derived()
+        if self.obs_type != "state":
+            shape = (self.image_size, self.image_size, 3)
+            derived[OBS_IMAGE] = (PolicyFeature(FeatureType.VISUAL, shape), OBS_IMAGE)
+        return derived
