@@ -111,3 +111,24 @@ def test_recording_without_an_operator_is_refused_in_one_line(command: Command, 
     done = command("cqn-data", "record", "--env.type=dmc", "--repo_id=local/d", f"--root={tmp_path / 'd'}", code=2)
     assert "has no scripted teleoperator" in done.stderr
     assert done.stderr.strip().count("\n") == 0
+
+
+@pytest.mark.parametrize(("preset", "env"), [
+    ("paper_dmc_state", ["--env.obs_type=state"]),
+    ("paper_dmc_pixels", ["--env.obs_type=pixels", "--env.image_size=32", "--policy.encoder_channels=[4,8]"]),
+])  # fmt: skip
+def test_shaped_reward_without_demonstrations(preset: str, env: list[str], command: Command, tmp_path: Path) -> None:
+    pytest.importorskip("dm_control")
+    dmc = ["--env.type=dmc", "--env.task=cartpole-balance", "--env.episode_length=12", *env]
+    sizes = ["--policy.hidden_dim=16", "--policy.feature_dim=8", "--policy.device=cpu", "--batch_size=8"]
+    ends = ["--steps=30", "--eval.freq=0", "--eval.final_n_episodes=2", f"--output_dir={tmp_path / 'run'}"]
+    command("cqn-train", "--policy.type=cqn", f"--policy.preset={preset}", *dmc, *sizes, *ends)
+    episodes = pd.read_csv(tmp_path / "run" / "episodes.csv")
+    assert (episodes["length"] == 12).all()
+    assert (episodes["return"] > 5).all()  # at most 1 in each simulator step; the pole begins upright
+    final = pd.read_csv(tmp_path / "run" / "evaluations.csv").iloc[-1]
+    assert final["success_rate"] == 0
+    assert final["mean_return"] > 5
+    model = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
+    evaluate = ["--eval.n_episodes=1", "--eval.batch_size=1", f"--output_dir={tmp_path}", "--policy.device=cpu"]
+    command("lerobot-eval", f"--policy.path={model}", *dmc[:3], *env[:2], *evaluate)
