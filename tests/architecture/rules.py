@@ -19,7 +19,7 @@ INSTALLED_AS = {
 # --- Which room may use which other one: prefixes of module names.
 ROOM_MAY_USE: dict[str, tuple[str, ...]] = {
     "lerobot_cqn": (),
-    "lerobot_cqn._plugin": ("train.envs",),
+    "lerobot_cqn._plugin": ("train.envs", "train.sim_arm"),
     "datasets_tools": ("lerobot_cqn.schema", "lerobot_cqn.errors"),
     "train": ("lerobot_cqn", "datasets_tools"),
 }

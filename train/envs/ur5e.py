@@ -230,6 +230,11 @@ class Arm:
         return np.array(self.data.qpos[self._qpos])
 
     @property
+    def joint_speeds(self) -> Array:
+        """Measured joint speeds, (6,) rad/s."""
+        return np.array(self.data.qvel[self._dofs])
+
+    @property
     def closure(self) -> float:
         """Measured gripper, 0 (open) to 1 (closed)."""
         return float(np.clip(self.data.qpos[self._finger] / GRIPPER_TRAVEL, 0.0, 1.0))

@@ -1,0 +1,152 @@
+"""The simulated UR5e as a LeRobot robot, with the faults that real ones have."""
+
+import time
+from typing import Any
+
+import numpy as np
+from lerobot.robots.robot import Robot
+from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+from numpy.typing import NDArray
+
+from lerobot_cqn.errors import ConfigError
+
+from ..envs.ur5e import STATE_NAMES
+from .config_sim_ur5e import SimUR5eConfig
+from .world import WORLDS, World
+
+__all__ = ["SimUR5e", "from_robot_units", "to_robot_units"]
+
+GRIPPER_SCALE = 100.0  # 0 (open) to 100 (closed)
+
+
+def to_robot_units(joints: NDArray[np.float64], closure: float) -> dict[str, float]:
+    """Joints (6,) rad and closure 0..1 as the robot speaks: degrees, and 0..100."""
+    values = [*np.degrees(joints), GRIPPER_SCALE * closure]
+    return {name: float(value) for name, value in zip(STATE_NAMES, values, strict=True)}
+
+
+def from_robot_units(values: dict[str, Any]) -> tuple[NDArray[np.float64], float]:
+    """The other way round. Raises KeyError for a joint that is not named."""
+    numbers = np.array([float(values[name]) for name in STATE_NAMES])
+    return np.radians(numbers[:6]), float(numbers[6] / GRIPPER_SCALE)
+
+
+class SimUR5e(Robot):
+    """The arm of the simulated station: absolute joint goals in degrees, four cameras, time that does not wait."""
+
+    config_class = SimUR5eConfig
+    name = "sim_ur5e"
+
+    def __init__(self, config: SimUR5eConfig) -> None:
+        super().__init__(config)
+        self.config = config
+        self.cameras = dict.fromkeys(config.camera_names)  # lerobot-record counts them
+        self._world: World | None = None
+        self._last: dict[str, Any] = {}
+
+    @property
+    def world(self) -> World:
+        """The world that this arm stands in. Raises DeviceNotConnectedError before `connect`."""
+        if self._world is None:
+            raise DeviceNotConnectedError(f"{self} is not connected: call connect() first.")
+        return self._world
+
+    @property
+    def observation_features(self) -> dict[str, Any]:
+        """Seven joints, with `state` the objects as well, and the cameras."""
+        names = [*STATE_NAMES, *(self._object_names() if self.config.state else ())]
+        shape = (self.config.image_height, self.config.image_width, 3)
+        return dict.fromkeys(names, float) | dict.fromkeys(self.config.camera_names, shape)
+
+    @property
+    def action_features(self) -> dict[str, type]:
+        """Seven absolute goals."""
+        return dict.fromkeys(STATE_NAMES, float)
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether it can be read and moved."""
+        return self._world is not None
+
+    @property
+    def is_calibrated(self) -> bool:
+        """There is nothing to calibrate."""
+        return True
+
+    def connect(self, calibrate: bool = True) -> None:
+        """Start the world. Raises DeviceAlreadyConnectedError the second time, ConfigError for a name that is taken."""
+        del calibrate
+        if self.is_connected:
+            raise DeviceAlreadyConnectedError(f"{self} is connected already.")
+        c = self.config
+        if c.world in WORLDS:
+            raise ConfigError(f"There is an arm in the world '{c.world}' already: give another --robot.world.")
+        self._world = WORLDS[c.world] = World(c.task, c.speed, c.ramp_s, c.seed)
+
+    def calibrate(self) -> None:
+        """Nothing to do."""
+
+    def configure(self) -> None:
+        """Nothing to do."""
+
+    def get_observation(self) -> dict[str, Any]:
+        """Joints in degrees, gripper 0..100, pictures uint8 [H, W, 3]. Raises what faults raise."""
+        world = self.world
+        with world.lock:
+            world.catch_up()
+            self._fail("disconnect", "error")
+            for fault in self._on("delay"):
+                time.sleep(fault.amount)
+                world.catch_up()
+            joints = to_robot_units(world.arm.joints, world.arm.closure)
+            if self.config.state:
+                state = world.task.state(world.arm)
+                joints |= {n: float(v) for n, v in zip(self._object_names(), state, strict=True)}
+            if self._on("frozen_joints"):
+                joints = {name: self._last.get(name, value) for name, value in joints.items()}
+            if self._on("nan"):
+                joints[STATE_NAMES[0]] = float("nan")
+            pictures = self._pictures(world)
+        self._last = {**joints, **pictures}
+        return dict(self._last)
+
+    def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
+        """Lead the joints to absolute goals in degrees; returns what is sent. Raises what faults raise."""
+        world = self.world
+        with world.lock:
+            world.catch_up()
+            self._fail("disconnect", "send_error")
+            stuck = self._on("stuck_joint")
+            world.jam(int(stuck[0].amount) if stuck else None)
+            joints, closure = from_robot_units(action)
+            world.command(joints, closure)
+        return to_robot_units(joints, closure)
+
+    def disconnect(self) -> None:
+        """End the world. Raises DeviceNotConnectedError the second time."""
+        self.world.cameras.close()
+        WORLDS.pop(self.config.world, None)
+        self._world = None
+
+    def _object_names(self) -> tuple[str, ...]:
+        from ..envs.tasks import TASKS
+
+        return tuple(f"object.{name}" for name in TASKS[self.config.task].state_names)
+
+    def _pictures(self, world: World) -> dict[str, NDArray[np.uint8]]:
+        frozen = bool(self._on("frozen_camera"))
+        height, width = self.config.image_height, self.config.image_width
+        return {
+            name: self._last[name] if frozen and name in self._last
+            else world.cameras.picture(world.arm.data, name, height, width)
+            for name in self.config.camera_names
+        }  # fmt: skip
+
+    def _on(self, kind: str) -> list[Any]:
+        return [fault for fault in self.config.faults if fault.kind == kind and fault.active(self.world.now)]
+
+    def _fail(self, *kinds: str) -> None:
+        for kind in kinds:
+            if self._on(kind):
+                kinds_of_error = {"error": RuntimeError}
+                raise kinds_of_error.get(kind, ConnectionError)(f"{self}: injected fault '{kind}'.")

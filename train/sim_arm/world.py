@@ -1,0 +1,163 @@
+"""The simulated world that a robot and a leader in one process share: it runs by a clock of its own."""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_cqn.errors import ConfigError, one_of
+
+from ..envs.cameras import Cameras
+from ..envs.tasks import TASKS
+from ..envs.ur5e import HOME, TIMESTEP, Arm
+
+__all__ = ["WORLDS", "World", "find_world"]
+
+Array = NDArray[np.float64]
+
+MAX_JOINT_SPEED = 1.0  # rad/s, of the leader
+_AT_HOME = 0.05  # rad of every joint
+_MOVED = 0.3  # rad of any joint: the arm has left home
+_REST_S = 0.3  # seconds at home before the person lays the scene out anew
+_BEHIND_S = 0.5  # most real seconds that are caught up at once; a process that slept longer lost the rest
+_LEASH = 0.25  # rad, how far the command may run ahead of the measured joint
+
+WORLDS: dict[str, "World"] = {}
+
+
+def find_world(name: str) -> "World":
+    """The world of a connected arm. Raises ConfigError where there is none of that name."""
+    if name not in WORLDS:
+        raise ConfigError(one_of("world", name, WORLDS) + " Connect --robot.type=sim_ur5e in this process first.")
+    return WORLDS[name]
+
+
+class World:
+    """Arm, objects and clock. Whoever looks at it first lets the time that has passed happen.
+
+    A person lays the scene out anew whenever the arm, after it was away, rests at home.
+
+    Attributes:
+        arm, task: of the station; fps: the leader's rate, 1/s of the simulated clock.
+        now: simulated seconds since the start; scenes: how many have been laid out.
+        fastest: highest joint speed so far, rad/s, and lowest, highest: joint angles so far, rad; measured in every
+            physics step, to check safety limits against.
+    """
+
+    fps = 10
+
+    def __init__(self, task: str, speed: float, ramp_s: float, seed: int) -> None:
+        self.task = TASKS[task]()
+        self.arm = Arm(self.task.mjcf())
+        self.cameras = Cameras(self.arm.model)
+        self.lock = threading.RLock()
+        self.speed, self.ramp_s = speed, ramp_s
+        self.now, self.scenes = 0.0, 0
+        self._stuck: tuple[int, float] | None = None
+        self.fastest = 0.0
+        self._rng = np.random.default_rng(seed)
+        self._clock = time.monotonic()
+        self._left, self._rested = False, 0.0
+        self._succeeded = False
+        self.arm.place(np.array(HOME), self.task.start_closure)
+        self.lowest, self.highest = np.array(HOME), np.array(HOME)
+        self._start = self._reference = self._goal = np.array(HOME)
+        self._closure, self._since = self.task.start_closure, 0.0
+        self.lay_out()
+
+    # What `envs.expert.ScriptedTeleoperator` steers by; it was written for the environment.
+
+    @property
+    def station_task(self) -> Any:
+        """The running task."""
+        return self.task
+
+    @property
+    def action_space(self) -> Any:
+        """Deltas of a step at `fps`, and the gripper."""
+        import gymnasium as gym
+
+        limits = np.array([MAX_JOINT_SPEED / self.fps] * 6 + [1.0], np.float32)
+        return gym.spaces.Box(np.append(-limits[:6], np.float32(0.0)), limits, dtype=np.float32)
+
+    @property
+    def success(self) -> bool:
+        """Whether the task has been done in this scene."""
+        return self._succeeded
+
+    @property
+    def away(self) -> bool:
+        """Whether the arm has left home in this scene."""
+        return self._left
+
+    def lay_out(self) -> None:
+        """A new scene; the arm stays where it is."""
+        with self.lock:
+            joints, closure = self.arm.joints, self.arm.closure
+            self.arm.place(joints, closure)
+            self.task.reset(self.arm, self._rng)
+            self.arm.forward()
+            self._start = self._reference = self._goal = joints
+            self._closure = closure
+            self._left, self._rested, self._succeeded = False, 0.0, False
+            self.scenes += 1
+
+    def command(self, joints: Array, closure: float) -> None:
+        """Lead the joints (6,) rad to a goal within `ramp_s`, and the gripper, 0 (open) to 1 (closed)."""
+        with self.lock:
+            self.catch_up()
+            measured = self.arm.joints
+            self._start = self._reference
+            self._goal = self.arm.clip(np.clip(joints, measured - _LEASH, measured + _LEASH))
+            self._closure, self._since = float(np.clip(closure, 0.0, 1.0)), 0.0
+
+    def jam(self, joint: int | None) -> None:
+        """Keep a joint where it is from now on, whatever it is told; None lets go."""
+        if joint is None or self._stuck is None or self._stuck[0] != joint:
+            self._stuck = None if joint is None else (joint, float(self.arm.joints[joint]))
+
+    def catch_up(self) -> None:
+        """Let the time since the last look happen."""
+        with self.lock:
+            real = time.monotonic()
+            passed = min(real - self._clock, _BEHIND_S) * self.speed
+            steps = int(passed / TIMESTEP)
+            # What is less than a physics step is left for the next look.
+            self._clock = real - (passed - steps * TIMESTEP) / self.speed
+            for _ in range(steps):
+                self._step()
+
+    def _step(self) -> None:
+        self._since += TIMESTEP
+        share = min(1.0, self._since / self.ramp_s)
+        before = self._reference
+        self._reference = self._start + (self._goal - self._start) * share
+        wanted = self._reference
+        if self._stuck is not None:
+            joint, angle = self._stuck
+            before, wanted = before.copy(), wanted.copy()
+            before[joint] = wanted[joint] = angle
+        self.arm.drive(before, wanted, self._closure, 1)
+        self.now += TIMESTEP
+        joints = self.arm.joints
+        self.fastest = max(self.fastest, float(np.abs(self.arm.joint_speeds).max()))
+        self.lowest, self.highest = np.minimum(self.lowest, joints), np.maximum(self.highest, joints)
+        self._succeeded = self._succeeded or self.task.success(self.arm)
+        away = float(np.abs(joints - HOME).max())
+        self._left = self._left or away > _MOVED
+        self._rested = self._rested + TIMESTEP if away < _AT_HOME else 0.0
+        if self._left and self._rested >= _REST_S:
+            self.lay_out()
+
+    def until(self, condition: Callable[[], bool], seconds: float) -> bool:
+        """Let real time pass until a condition holds; whether it did within `seconds`."""
+        deadline = time.monotonic() + seconds
+        while not condition():
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.005)
+            self.catch_up()
+        return True
