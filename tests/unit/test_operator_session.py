@@ -1,0 +1,167 @@
+"""The session: every event in every state, and what holds whatever happens."""
+
+import threading
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cqn_train.operator_page.session import TRANSITIONS, Event, Label, RefusedError, Session, State
+
+# What a person would expect, written down on its own: state -> event -> next state; the rest is refused.
+EXPECTED = {
+    "waiting": {"start": "running"},
+    "running": {
+        "pause": "paused", "absent": "paused", "take_over": "teaching", "time_up": "labelling", "success": "resetting",
+        "failure": "resetting", "discard": "resetting",
+    },
+    "paused": {
+        "resume": "running", "take_over": "teaching", "success": "resetting", "failure": "resetting",
+        "discard": "resetting",
+    },
+    "teaching": {
+        "hand_back": "running", "pause": "paused", "absent": "paused", "time_up": "labelling", "success": "resetting",
+        "failure": "resetting", "discard": "resetting",
+    },
+    "labelling": {"success": "resetting", "failure": "resetting", "discard": "resetting"},
+    "resetting": {"ready": "waiting"},
+    "faulted": {"recovered": "resetting"},
+    "stopped": {},
+}  # fmt: skip
+PATHS: dict[State, list[Event]] = {
+    State.WAITING: [],
+    State.RUNNING: [Event.START],
+    State.PAUSED: [Event.START, Event.PAUSE],
+    State.TEACHING: [Event.START, Event.TAKE_OVER],
+    State.LABELLING: [Event.START, Event.TIME_UP],
+    State.RESETTING: [Event.START, Event.SUCCESS],
+    State.FAULTED: [Event.FAULT],
+    State.STOPPED: [Event.STOP],
+}
+events = st.sampled_from(list(Event))
+
+
+def session(state: State) -> Session:
+    made = Session()
+    for event in PATHS[state]:
+        made.apply(event)
+    assert made.state is state
+    return made
+
+
+@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("event", Event)
+def test_every_event_in_every_state(state: State, event: Event) -> None:
+    made = session(state)
+    expected = dict(EXPECTED[state])
+    expected["stop"] = "stopped"
+    if state is not State.STOPPED:
+        expected["fault"] = "faulted"
+    before = made.snapshot()
+    if event in expected:
+        assert made.apply(event) == expected[event]
+    else:
+        with pytest.raises(RefusedError, match=f"'{event}' has no place while {state}"):
+            made.apply(event)
+        assert made.snapshot() == before
+
+
+def test_every_state_is_in_the_table() -> None:
+    assert set(TRANSITIONS) == set(State) == set(PATHS)
+
+
+@given(st.lists(events, max_size=40))
+def test_whatever_happens(sequence: list[Event]) -> None:
+    made, changes = Session(), []
+    made.on_change = lambda s: changes.append(s.state)
+    started, applied, stopped = 0, 0, False
+    for event in sequence:
+        before, labels = made.state, dict(made.labels)
+        try:
+            made.apply(event)
+        except RefusedError:
+            assert made.state is before
+            continue
+        applied += 1
+        started += event is Event.START
+        stopped = stopped or event is Event.STOP
+        assert made.episode == started - 1
+        assert (made.state is State.STOPPED) == stopped  # nothing leaves it, and only stop enters
+        # A label is given once, by a person, to the episode that ran, and never changes by itself.
+        assert labels.items() <= made.labels.items()
+        assert len(made.labels) - len(labels) == (event in ("success", "failure", "discard"))
+        # Every episode before the present one has its label.
+        assert set(made.labels) >= set(range(made.episode))
+    assert len(changes) == applied
+
+
+def test_an_episode_in_which_the_robot_failed_is_neither_lost_nor_labelled_by_itself() -> None:
+    for path in (PATHS[State.RUNNING], PATHS[State.PAUSED], PATHS[State.TEACHING], PATHS[State.LABELLING]):
+        made = Session()
+        for event in path:
+            made.apply(event)
+        made.apply(Event.FAULT, "unplugged")
+        made.apply(Event.FAULT)  # and again while it is looked after
+        assert made.fault == "unplugged"
+        assert made.apply(Event.RECOVERED) is State.LABELLING
+        assert made.fault == ""
+        assert made.labels == {}
+        made.apply(Event.DISCARD)
+        assert made.labels == {0: Label.DISCARD}
+
+
+def test_between_episodes_a_fault_asks_for_no_label() -> None:
+    made = session(State.RESETTING)
+    made.apply(Event.FAULT)
+    assert made.apply(Event.RECOVERED) is State.RESETTING
+
+
+def test_relabelling() -> None:
+    made = session(State.RESETTING)
+    with pytest.raises(RefusedError, match="finished episodes are 0 to 0"):
+        made.relabel(3, Label.FAILURE)
+    made.relabel(0, Label.SUCCESS)  # as it is
+    assert made.take_relabelled() == {}
+    made.relabel(0, Label.FAILURE)
+    made.relabel(0, Label.DISCARD)
+    assert made.take_relabelled() == {0: Label.DISCARD}
+    assert made.take_relabelled() == {}
+    assert made.snapshot()["labels"] == {"0": "discard"}
+    with pytest.raises(RefusedError, match="none yet"):
+        Session().relabel(0, Label.SUCCESS)
+
+
+def test_a_person_is_offered_what_is_possible() -> None:
+    assert session(State.WAITING).allowed() == [Event.STOP, Event.START]
+    assert Event.TIME_UP not in session(State.RUNNING).allowed()
+
+
+def press(event: Event, made: Session, barrier: threading.Barrier, refused: list[Event]) -> None:
+    barrier.wait()
+    try:
+        made.apply(event)
+    except RefusedError:
+        refused.append(event)
+
+
+def test_of_two_people_who_press_at_once_one_is_refused() -> None:
+    for _ in range(50):
+        made, refused = session(State.RUNNING), list[Event]()
+        barrier = threading.Barrier(2)
+
+        def press(
+            event: Event, made: Session = made, refused: list[Event] = refused, barrier: threading.Barrier = barrier
+        ) -> None:
+            barrier.wait()
+            try:
+                made.apply(event)
+            except RefusedError:
+                refused.append(event)
+
+        threads = [threading.Thread(target=press, args=(e,)) for e in (Event.SUCCESS, Event.FAILURE)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert len(refused) == 1
+        assert made.labels == {0: Label.SUCCESS if refused == [Event.FAILURE] else Label.FAILURE}

@@ -1,0 +1,1 @@
+"""LeRobot arms for online training: limits that every command passes, and an environment over any `Robot`."""

@@ -1,0 +1,96 @@
+"""Safety limits as pure functions: from a wanted goal to one that may be sent. Units are the robot's own."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_cqn.errors import ConfigError
+
+__all__ = ["Limits", "Verdict", "allowed_goal"]
+
+Array = NDArray[np.float64]
+Forward = Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a goal must keep to; each array is [D], one value a joint in the robot's units.
+
+    low, high: joint limits.
+    max_step: largest distance of a goal from the measured joint.
+    max_speed: largest change of the goal, units a second.
+    box: corners (low, high) of the workspace, m, with `forward`: joints [D] -> tip [3] in m; None: no such check.
+
+    Raises ConfigError when a range is empty, not finite, or a box has no kinematics.
+    """
+
+    low: Array
+    high: Array
+    max_step: Array
+    max_speed: Array
+    box: tuple[Array, Array] | None = None
+    forward: Forward | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if not np.isfinite([self.low, self.high]).all() or (self.low > self.high).any():
+            raise ConfigError(f"Joint limits must be finite and low <= high, got {self.low} to {self.high}.")
+        if not (self.max_step > 0).all() or not (self.max_speed > 0).all():
+            raise ConfigError(f"max_step and max_speed must be positive, got {self.max_step} and {self.max_speed}.")
+        if self.box is not None and self.forward is None:
+            raise ConfigError("A workspace box needs the arm's kinematics: give them, or leave out the box.")
+
+    @classmethod
+    def from_ranges(
+        cls, names: tuple[str, ...], ranges: Mapping[str, tuple[float, float]], step_share: float, speed_share: float
+    ) -> "Limits":
+        """Limits from each joint's range: a step of `step_share` and `speed_share` of it a second.
+
+        Raises ConfigError for a joint without a range.
+        """
+        missing = [name for name in names if name not in ranges]
+        if missing:
+            raise ConfigError(f"No limits for the joint '{missing[0]}': expected one range for each of {list(names)}.")
+        low, high = (np.array([ranges[name][i] for name in names], dtype=np.float64) for i in (0, 1))
+        return cls(low, high, step_share * (high - low), speed_share * (high - low))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A goal [D] that may be sent, and why it differs from the wanted one: names of limits, empty where it does not."""
+
+    goal: Array
+    reasons: tuple[str, ...] = ()
+
+
+def allowed_goal(wanted: Array, measured: Array, last: Array, seconds: float, limits: Limits) -> Verdict:
+    """The nearest goal to `wanted` that keeps to all limits.
+
+    Args:
+        wanted: goal [D] that is asked for.
+        measured: joints [D] as read now.
+        last: goal [D] that was sent last.
+        seconds: since the last goal was sent, > 0.
+        limits: what to keep to.
+
+    A goal that is not finite, or whose tip would leave the box, is replaced by the last one: the arm holds.
+    """
+    if not np.isfinite(wanted).all():
+        return Verdict(last, ("not finite",))
+    reasons, goal = [], wanted.astype(np.float64)
+    steps = (
+        ("speed", last - limits.max_speed * seconds, last + limits.max_speed * seconds),
+        ("step", measured - limits.max_step, measured + limits.max_step),
+        ("joint limit", limits.low, limits.high),  # last, so that it holds whatever the others say
+    )
+    for name, low, high in steps:
+        bounded = np.clip(goal, low, high)
+        if (bounded != goal).any():
+            reasons.append(name)
+        goal = bounded
+    if limits.box is not None and limits.forward is not None:
+        tip, (low, high) = limits.forward(goal), limits.box
+        if (tip < low).any() or (tip > high).any():
+            return Verdict(last, (*reasons, "workspace"))
+    return Verdict(goal, tuple(reasons))
