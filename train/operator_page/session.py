@@ -1,10 +1,8 @@
-r"""The session of a person at an arm, as a state machine: no web, no robot, no time in it.
+"""The session of a person at an arm, as a state machine: no web, no robot, no time in it.
 
-WAITING --start--> RUNNING --success/failure/discard--> RESETTING --ready--> WAITING
-|  ^  \--time up--> LABELLING --success/failure/discard--^
-pause v  | resume
-PAUSED          TEACHING: a person drives with the leader, in the middle of an episode
-a fault leads to FAULTED from everywhere, stop to STOPPED, which nothing leaves
+An episode runs from `start` to `success`, `failure` or `discard`, by a person's hand; in between it may be paused, or
+driven by the person (`take_over`). When its time is up it waits for its label. Then the person resets the scene, and the
+next one may start. A fault leads to FAULTED from everywhere, `stop` to STOPPED, which nothing leaves.
 """
 
 import threading
