@@ -1,8 +1,8 @@
 """The session of a person at an arm, as a state machine: no web, no robot, no time in it.
 
 An episode runs from `start` to `success`, `failure` or `discard`, by a person's hand; in between it may be paused, or
-driven by the person (`take_over`). When its time is up it waits for its label. Then the person resets the scene, and the
-next one may start. A fault leads to FAULTED from everywhere, `stop` to STOPPED, which nothing leaves.
+driven by the person (`take_over`). When its time is up it waits for its label. Then the person resets the scene, and
+the next one may start. A fault leads to FAULTED from everywhere, `stop` to STOPPED, which nothing leaves.
 """
 
 import threading
