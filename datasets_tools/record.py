@@ -316,8 +316,8 @@ def _teleoperator(env: Any, env_config: Any, config: RecordConfig) -> ScriptedTe
     make = getattr(env.unwrapped, "scripted_teleoperator", None)
     if make is None:
         raise ConfigError(
-            f"Environment '{env_config.type}' has no scripted teleoperator: record with lerobot-record, or choose one"
-            " that offers scripted_teleoperator()."
+            f"Environment '{env_config.type}' has no scripted teleoperator: record a person with lerobot-record, or"
+            " train without demonstrations (cqn-train --demo_batch_size=0 --action_bounds=environment)."
         )
     tremor = {"tremor_rad": config.tremor_rad} if config.tremor_rad > 0 else {}
     if tremor and "tremor_rad" not in inspect.signature(make).parameters:

@@ -16,8 +16,9 @@ __all__ = ["DrQv2Config"]
 class DrQv2Config(RLConfig):
     """DrQ-v2 (Yarats et al. 2022) and DrQ-v2+, the baselines that the paper compares CQN with.
 
-    `preset` is drqv2_plus (distributional critic and the paper's recipes for demonstrations) or drqv2; every field
-    left at None takes the preset's value, every field given replaces it. Read the result from `settings`.
+    `preset` is drqv2_plus (distributional critic and the paper's recipes for demonstrations), drqv2, or one of ours
+    (laptop_state, laptop_pixels: DrQ-v2+ at the sizes of CQN's presets of these names); every field left at None takes
+    the preset's value, every field given replaces it. Read the result from `settings`.
     Meaning, range and source of each number: `lerobot_cqn/settings.py`.
 
     Raises ConfigError for an unknown preset or a value out of range.

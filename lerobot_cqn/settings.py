@@ -156,6 +156,9 @@ DRQV2_PRESETS: dict[str, dict[str, Any]] = {
     # Last table of the paper's appendix.
     "drqv2_plus": {},
     "drqv2": {"distributional": False, "exploration_noise": 0.2, "weight_decay": 0.0},
+    # Ours: DrQ-v2+ at the sizes and learning rates of CQN's presets of the same names.
+    "laptop_state": {"frame_stack": 1, "hidden_dim": 256, "lr": 3e-4},
+    "laptop_pixels": {"frame_stack": 2, "encoder_channels": (16, 32, 64, 64), "hidden_dim": 256, "lr": 1e-4},
 }
 
 

@@ -1,5 +1,6 @@
 """A policy with its processors: frames of an environment in, commands and replay episodes out."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -42,6 +43,15 @@ class Agent:
         if not self.policy.low_dim_keys:
             return None
         return torch.cat([prepared[key] for key in self.policy.low_dim_keys], dim=-1).float().cpu().numpy()
+
+    def inside(self, bounds: Mapping[str, NDArray[Any]] | None) -> NDArray[Any]:
+        """Which action dimensions [D] end before the environment's bounds (`min`, `max`) do: more is possible."""
+        extremes = [self.postprocessor(torch.full((1, self.policy.action_dims), end))[0].numpy() for end in (-1.0, 1.0)]
+        if bounds is None:
+            return np.ones(self.policy.action_dims, dtype=bool)
+        near = 0.01 * (bounds["max"] - bounds["min"])
+        room: NDArray[Any] = (extremes[0] > bounds["min"] + near) | (extremes[1] < bounds["max"] - near)
+        return room
 
     def pixels(self, frame: Frame) -> list[NDArray[Any]]:
         """Images of a frame as the replay stores them: per view uint8 [K, 3, H, W]."""

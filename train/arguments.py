@@ -41,7 +41,7 @@ Train a Coarse-to-fine Q-Network from demonstrations, then online.
   without demonstrations:                    cqn-train --policy.preset=paper_dmc_state --env.type=dmc ...
   evaluate with LeRobot:                     lerobot-eval --policy.path=.../pretrained_model --env.type=ur5e_station
 
-Presets (--policy.preset=NAME; every number can be replaced, docs/algorithm.md has them side by side):
+Presets (--policy.preset=NAME; every number can be replaced, docs/algorithm.md and docs/baselines.md have them):
 """
 
 PRESETS: dict[str, dict[str, str]] = {
@@ -57,6 +57,8 @@ PRESETS: dict[str, dict[str, str]] = {
     "drqv2": {
         "drqv2_plus": "the paper's DrQ-v2+: distributional critic, learns from demonstrations (default)",
         "drqv2": "DrQ-v2 as published; demonstrations are experience like any other",
+        "laptop_state": "ours: DrQ-v2+ at the sizes of CQN's laptop_state",
+        "laptop_pixels": "ours: DrQ-v2+ at the sizes of CQN's laptop_pixels",
     },
 }
 LAST = "Add --env.type=... or --policy.type=cqn before --help to see their options; --debug shows tracebacks.\n"

@@ -32,7 +32,7 @@ A plan is a YAML file:
   common: [--steps=2400, --offline_updates=150, --threads=1]     # arguments of cqn-train for every run
   methods:
     cqn: [--policy.type=cqn, --policy.preset=laptop_state]
-    cbc: [--policy.type=cqn, --policy.preset=laptop_state, --policy.rl_loss_scale=0]
+    cbc: [--policy.type=cqn, --policy.preset=laptop_state, --policy.rl_loss_scale=0, --relabel=false]
   tasks:
     click_button: [--env.type=ur5e_station, --env.task=click_button, --dataset.repo_id=local/click_f,
                    --dataset.root=data/click_f]
@@ -81,6 +81,13 @@ class Run:
             return []
         with path.open(newline="") as file:
             return list(csv.DictReader(file))
+
+    def last_words(self) -> str:
+        """Last line of its log, and where it is."""
+        path = self.folder.with_suffix(".log")
+        lines = path.read_text(errors="replace").split("\n") if path.is_file() else []
+        said = next((line.strip() for line in reversed(lines) if line.strip()), "")
+        return f"{said} (log: {path})" if said else f"see {path}"
 
     @property
     def done(self) -> bool:
@@ -167,12 +174,32 @@ def work(runs: Sequence[Run], processes: int, console: Console, score: str = "su
                 for run in running:
                     run.look()
                     if run.state not in ("running", "done"):
-                        console.print(f"{run.task} / {run.method} / {run.seed} {run.state}: see {run.folder}.log")
+                        console.print(f"{run.task} / {run.method} / {run.seed} {run.state}: {run.last_words()}")
                 live.update(_table(runs, score, time.monotonic() - begun))
     except KeyboardInterrupt:
-        console.print("Stopping: the runs are saving their checkpoints ...")
+        console.print("\nStopping: the runs are saving their checkpoints ...")
         _stop([run for run in runs if run.process])
         raise
+    if not console.is_terminal:
+        console.print()
+
+
+def check(runs: Sequence[Run]) -> None:
+    """Parse the arguments of every method on every task, before hours of work. Raises ConfigError for a bad one."""
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    from . import envs  # noqa: F401  # registers our environments
+    from .arguments import parse
+
+    register_third_party_plugins()
+    seen = set()
+    for run in runs:
+        if (run.method, run.task) not in seen and run.state != "done":
+            seen.add((run.method, run.task))
+            try:
+                parse([*run.arguments, f"--output_dir={run.folder}"]).validate()
+            except CQNError as error:
+                raise ConfigError(f"{run.task} / {run.method}: {error}") from error
 
 
 def _stop(runs: Sequence[Run]) -> None:
@@ -240,6 +267,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         plan = load_plan(Path(arguments[0]))
         runs = runs_of(plan, folder)
         if "report_only" not in options:
+            check([run for run in runs if not run.done])
             work(runs, int(processes), console, plan.score)
         write_report(plan, runs, folder, console)
     except KeyboardInterrupt:

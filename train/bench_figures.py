@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from .bench import Plan
 
-__all__ = ["Curve", "draw_aggregate", "draw_curves", "draw_table"]
+__all__ = ["Curve", "draw_aggregate", "draw_curves", "draw_table", "spread"]
 
 COLOURS = ("#2e6fb6", "#c45c26", "#3a8f5c", "#8a56a8", "#6b6f76", "#b8942c", "#1f9aa0", "#b0457b")
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Scores of a method on a task: steps [K], values [seeds, K]."""
+    """Scores of a method on a task at the K-th evaluation: values [seeds, K], steps [K] their mean over seeds."""
 
     task: str
     method: str
@@ -34,6 +34,11 @@ class Curve:
             }
             for step, column in zip(self.steps, self.values.T, strict=True)
         ]  # fmt: skip
+
+
+def spread(values: NDArray[np.float64]) -> Any:
+    """Standard deviation of a sample over seeds, the first axis; 0 for a single one."""
+    return values.std(axis=0, ddof=1) if len(values) > 1 else np.zeros(values.shape[1:])
 
 
 def draw_aggregate(iqm: Mapping[str, tuple[float, float, float]], plan: "Plan", seeds: int, path: Path) -> None:
@@ -64,12 +69,12 @@ def draw_table(scores: Mapping[str, NDArray[np.float64]], plan: "Plan", seeds: i
     tasks = list(plan.tasks) + (["all tasks"] if len(plan.tasks) > 1 else [])
     means = np.array([[*v.mean(axis=0), *([v.mean()] if len(plan.tasks) > 1 else [])] for v in scores.values()])
     spreads = np.array(
-        [[*v.std(axis=0), *([v.mean(axis=1).std()] if len(plan.tasks) > 1 else [])] for v in scores.values()]
+        [[*spread(v), *([spread(v.mean(axis=1))] if len(plan.tasks) > 1 else [])] for v in scores.values()]
     )
-    figure = Figure(figsize=(2.0 + 1.5 * len(tasks), 1.2 + 0.38 * len(scores)), layout="constrained")
+    figure = Figure(figsize=(max(5.2, 2.0 + 1.5 * len(tasks)), 1.2 + 0.38 * len(scores)), layout="constrained")
     axis = figure.subplots()
     top = 1.0 if plan.score == "success_rate" else float(max(means.max(), 1e-9))
-    axis.imshow(means, cmap="Blues", vmin=0, vmax=1.25 * top, aspect="auto")
+    axis.imshow(means, cmap="Blues", vmin=0, vmax=2 * top, aspect="auto")  # light enough for black text
     for row, column in np.ndindex(means.shape):
         text = f"{means[row, column]:.{plan.digits}f} ± {spreads[row, column]:.{plan.digits}f}"
         best = means[row, column] >= means[:, column].max() - 1e-9
@@ -84,7 +89,7 @@ def draw_table(scores: Mapping[str, NDArray[np.float64]], plan: "Plan", seeds: i
 
 
 def draw_curves(curves: Sequence[Curve], plan: "Plan", path: Path) -> None:
-    """Mean over seeds with the range between the worst and the best one, one panel a task."""
+    """Mean over seeds with the range from the lowest to the highest one, one panel a task."""
     from matplotlib.figure import Figure
 
     columns = min(3, len(plan.tasks))
@@ -100,7 +105,7 @@ def draw_curves(curves: Sequence[Curve], plan: "Plan", path: Path) -> None:
             )
             low, high = curve.values.min(axis=0), curve.values.max(axis=0)
             axis.fill_between(curve.steps, low, high, color=colour, alpha=0.18, linewidth=0)
-        axis.set(title=task.replace("_", " "), xlabel="control steps online")
+        axis.set(title=task.replace("_", " "), xlabel="control steps online (band: lowest to highest seed)")
         if plan.score == "success_rate":
             axis.set_ylim(-0.03, 1.03)
         axis.grid(alpha=0.25)

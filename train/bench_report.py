@@ -11,7 +11,7 @@ from rich.console import Console
 
 from lerobot_cqn.errors import ConfigError, DataError
 
-from .bench_figures import Curve, draw_aggregate, draw_curves, draw_table
+from .bench_figures import Curve, draw_aggregate, draw_curves, draw_table, spread
 
 if TYPE_CHECKING:
     from .bench import Plan, Run
@@ -105,7 +105,7 @@ def _markdown(
     heads = ["method", *plan.tasks, "IQM (95 %)", f"P({next(iter(scores))} better) (95 %)"]
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     for method, values in scores.items():
-        pairs = zip(values.mean(axis=0), values.std(axis=0), strict=True)
+        pairs = zip(values.mean(axis=0), spread(values), strict=True)
         cells = [f"{m:.{digits}f} ± {s:.{digits}f}" for m, s in pairs]
         versus = "{:.2f} ({:.2f}-{:.2f})".format(*better[method]) if method in better else ""
         middle = "{:.{d}f} ({:.{d}f}-{:.{d}f})".format(*iqm[method], d=digits)
@@ -121,13 +121,18 @@ def _markdown(
 
 
 def _curve(plan: "Plan", runs: Sequence["Run"], task: str, method: str) -> Curve | None:
-    """Over seeds, interpolated to common steps, since runs end episodes at different ones; None where none is done."""
+    """Over seeds, evaluation by evaluation: they lie at ends of episodes, so their steps differ a little.
+
+    None where no run is done. Where runs differ in their number of evaluations, the last ones before the end are left
+    out.
+    """
     found = []
     for run in runs:
         rows = run.rows() if (run.task, run.method) == (task, method) else []
         if any(row["phase"] == "final" for row in rows):
-            found.append(np.array([[float(row["env_steps"]), float(row[plan.score])] for row in rows]))
+            found.append([(float(row["env_steps"]), float(row[plan.score])) for row in rows])
     if not found:
         return None
-    steps = np.unique(np.round(np.concatenate([points[:, 0] for points in found]), -1))
-    return Curve(task, method, steps, np.array([np.interp(steps, points[:, 0], points[:, 1]) for points in found]))
+    count = min(len(points) for points in found)
+    points = np.array([[*points[: count - 1], points[-1]] for points in found])  # [seeds, K, 2]
+    return Curve(task, method, points[:, :, 0].mean(axis=0), points[:, :, 1])

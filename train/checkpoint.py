@@ -61,7 +61,9 @@ def save(
     folder = output_dir / "checkpoints"
     target = folder / f"{counters.env_steps:06d}"
     temporary = folder / f".{target.name}.tmp"
-    shutil.rmtree(temporary, ignore_errors=True)
+    for left in folder.glob(".*.tmp"):  # of a process that was killed while it saved
+        if left.is_dir() and not left.is_symlink():
+            shutil.rmtree(left, ignore_errors=True)
     model, state = temporary / "pretrained_model", temporary / "training_state"
     state.mkdir(parents=True)
     agent.policy.save_pretrained(model)

@@ -62,7 +62,7 @@ def build(config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], 
     rng = seed_everything(config.seed)
     env = GymEnvironment(config.env, config.policy)
     agent = make_agent(config, checkpoint, env)
-    check_fits(config.env, agent.policy)
+    check_fits(config.env, agent.policy, "policy" if config.continues else "dataset")
     s = config.policy.settings
     scenes: Scenes = OneScene(env)
     if config.eval.batch_size > 1:
@@ -78,14 +78,14 @@ def build(config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], 
             for episode in load_episodes(config.dataset, agent, lambda i, n: monitor.advance(i, f"episode {i}/{n}")):
                 replay.add_demonstration(episode)
                 demonstrations.append(replace(episode, pixels=()))
-        for sentence in warnings_about(demonstrations):
+        for sentence in warnings_about(demonstrations, free=agent.inside(env.action_bounds())):
             monitor.message(f"Warning: {sentence}")
         finished = replay.reopen() if checkpoint is not None else []
     config.output_dir.mkdir(parents=True, exist_ok=True)
     run_config = draccus.encode(config)
     if checkpoint is None and replay.episodes:
         picture = config.output_dir / "first_batch.png"
-        sizes = (min(4, config.recipe.batch_size), 4 if replay.demonstrations else 0)
+        sizes = (256, 256 if replay.demonstrations else 0)  # enough to have a reward among them
         draw_batch(replay.sample(*sizes, np.random.default_rng(config.seed)), picture)
         monitor.message(f"First batch: {picture}")
     also: list[Log] = []
@@ -152,33 +152,47 @@ def make_agent(config: RunConfig, checkpoint: Path | None, env: GymEnvironment) 
         else:
             policy = make_policy(config.policy, env_cfg=config.env)
         if config.recipe.action_bounds == "environment":
-            stats[ACTION] = env.action_bounds()
+            bounds = env.action_bounds()
+            if bounds is None:
+                raise ConfigError("The environment bounds no action: give --action_bounds=data and a dataset.")
+            stats[ACTION] = bounds
         pre, post = make_pre_post_processors(config.policy, dataset_stats=stats)
     policy.train()
     return Agent(policy, pre, post)
 
 
-def check_fits(env: EnvConfig, policy: RLPolicy) -> None:
-    """Environment and policy must speak of the same things. Raises ConfigError, in one line, where they do not."""
+def check_fits(env: EnvConfig, policy: RLPolicy, source: str) -> None:
+    """Environment and policy must speak of the same things. Raises ConfigError, in one line, where they do not.
+
+    source: where the policy's features come from, for the message.
+    """
     given, needed = env_to_policy_features(env), policy.config.input_features or {}
     for key, feature in needed.items():
         if key not in given:
             raise ConfigError(
-                f"The policy needs '{key}', which the environment does not give (it gives {sorted(given)}): "
+                f"The {source} has '{key}', which the environment does not give (it gives {sorted(given)}): "
                 "change --env.obs_type / --env.cameras, or train on a dataset with these features."
             )
         if tuple(given[key].shape) != tuple(feature.shape):
             raise ConfigError(
                 f"'{key}' has shape {tuple(given[key].shape)} in the environment, but {tuple(feature.shape)} in the "
-                "policy (channels, height, width for cameras): record or resize to one size."
+                f"{source}: "
+                + (
+                    "set --env.image_size or resize the dataset (cqn-data resize)."
+                    if feature.type is FeatureType.VISUAL
+                    else "use the environment of the demonstrations."
+                )
             )
     unseen = [key for key, f in given.items() if f.type is FeatureType.VISUAL and key not in needed]
     if unseen:
-        raise ConfigError(f"The policy has not seen the camera '{unseen[0]}': leave it out, or train on it.")
+        raise ConfigError(
+            f"The {source} has not the environment's camera '{unseen[0]}': leave it out (--env.cameras, or "
+            "--env.obs_type=state for none), or use a dataset with it."
+        )
     action = next(f for f in given.values() if f.type is FeatureType.ACTION)
     if action.shape[0] != policy.action_dims:
         raise ConfigError(
-            f"The environment's action has {action.shape[0]} dimensions, the policy's (from its dataset) "
+            f"The environment's action has {action.shape[0]} dimensions, the {source}'s "
             f"{policy.action_dims}: use the environment the demonstrations were recorded in."
         )
 

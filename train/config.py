@@ -122,7 +122,9 @@ class RunConfig:
         if self.output_dir is None:
             raise ConfigError("No output directory: give --output_dir=DIR.")
         if self.env is None:
-            raise ConfigError("No environment: give --env.type=..., for example --env.type=ur5e_station.")
+            raise ConfigError(
+                "No environment: give --env.type=..., for example --env.type=ur5e_station (lerobot-train needs none)."
+            )
         recipe = self.recipe
         learns_from_data = recipe.demo_batch_size > 0 or self.offline_updates > 0
         if not self.dataset.repo_id and (learns_from_data or (recipe.action_bounds == "data" and not self.continues)):

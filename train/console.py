@@ -68,7 +68,8 @@ class ConsoleMonitor:
         if not self.console.is_terminal and now - self._logged > LOG_EVERY_S:
             self._logged = now
             left = (now - self._begun) / max(done - self._first, 1) * max(self._total - done, 0)
-            self.console.print(f"{self._name:>8}  {done}/{self._total}  eta {left:.0f} s  {self._note}")
+            part = f"{min(done, self._total)}/{self._total}"
+            self.console.print(f"{self._name:>8}  {part}  eta {left:.0f} s  {self._note}")
 
     def message(self, text: str) -> None:
         """A line that stays."""

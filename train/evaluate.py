@@ -56,10 +56,13 @@ class Evaluation:
         return wilson_interval(self.successes, self.n)
 
     def __str__(self) -> str:
-        """For a person: rate, n and interval; the return where it says more than the rate."""
+        """For a person: success rate, n and interval; the return where rewards are more than successes."""
         low, high = self.interval
-        text = f"{self.success_rate:.2f} (n={self.n}, 95 % {low:.2f}-{high:.2f})"
-        return text if abs(self.mean_return - self.success_rate) < 1e-6 else f"{text}  return {self.mean_return:.1f}"
+        success = f"success {self.success_rate:.2f} (n={self.n}, 95 % {low:.2f}-{high:.2f})"
+        if abs(self.mean_return - self.success_rate) < 1e-6:
+            return success
+        returned = f"return {self.mean_return:.3g} (n={self.n})"
+        return f"{returned}  {success}" if self.successes else returned
 
 
 def wilson_interval(successes: int, n: int, z: float = 1.959964) -> tuple[float, float]:

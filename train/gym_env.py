@@ -82,11 +82,11 @@ class GymEnvironment(_Gym):
         success = bool(info.get("is_success", info.get("succeed", False)))
         return Outcome(self.frame(observation), float(reward), bool(terminated), bool(truncated), success)
 
-    def action_bounds(self) -> dict[str, NDArray[Any]]:
-        """`min` and `max` of the action, [D] each. Raises ConfigError where the environment does not bound it."""
+    def action_bounds(self) -> dict[str, NDArray[Any]] | None:
+        """`min` and `max` of the action, [D] each; None where the environment does not bound it."""
         space = self.env.action_space
         if not isinstance(space, gym.spaces.Box) or not space.is_bounded():
-            raise ConfigError(f"The environment bounds no action ({space}): give --action_bounds=data and a dataset.")
+            return None
         return {"min": np.asarray(space.low, np.float32), "max": np.asarray(space.high, np.float32)}
 
     def render(self) -> NDArray[Any]:

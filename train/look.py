@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from cqn_data.threshold import suggest
-from lerobot_cqn.schema import Batch
+from lerobot_cqn.schema import Batch, Observation
 
 from .replay import Episode
 
@@ -25,11 +25,12 @@ TOO_MANY = 0.2  # share of the steps
 INK, PAPER, GRID, UP, DOWN = (24, 26, 31), (255, 255, 255), (228, 230, 235), (46, 111, 182), (196, 92, 38)
 
 
-def warnings_about(episodes: Sequence[Episode]) -> list[str]:
+def warnings_about(episodes: Sequence[Episode], free: NDArray[Any] | None = None) -> list[str]:
     """Sentences about demonstrations from which learning is hard; empty when nothing looks wrong.
 
     Args:
         episodes: in normalised units, as the replay takes them.
+        free: action dimensions [D] whose bounds could be wider; None: all. Where the environment ends, nothing is lost.
     """
     if not episodes:
         return []
@@ -39,11 +40,11 @@ def warnings_about(episodes: Sequence[Episode]) -> list[str]:
     actions = np.concatenate([episode.action for episode in episodes])
     varied = np.ptp(actions, axis=0) > 0
     joints = varied & ~np.isin(np.round(np.abs(actions), 3), (0.0, 1.0)).all(axis=0)  # a gripper is open or shut
-    at_bound = float((np.abs(actions[:, joints]) >= AT_BOUND).mean(axis=0).max()) if joints.any() else 0.0
-    if at_bound > TOO_MANY:
+    at_bound = (np.abs(actions) >= AT_BOUND).mean(axis=0) * joints * (True if free is None else free)
+    if (at_bound > TOO_MANY).any():
+        which = ", ".join(f"{i} ({at_bound[i]:.0%})" for i in np.flatnonzero(at_bound > TOO_MANY))
         found.append(
-            f"One action dimension is at its bounds in {at_bound:.0%} of the steps: the bounds may be too narrow"
-            " (cqn-data bounds)."
+            f"Action dimensions at their bounds in many steps: {which}; the bounds may be too narrow (cqn-data bounds)."
         )
     states = [episode.low_dim for episode in episodes if episode.low_dim is not None]
     if states and (pauses := suggest(states)).clear and pauses.share > TOO_MANY:
@@ -55,17 +56,18 @@ def warnings_about(episodes: Sequence[Episode]) -> list[str]:
 
 
 def draw_batch(batch: Batch, path: Path) -> None:
-    """Picture of the first samples: what the policy sees, what was done, what it is taken to be worth.
+    """Picture of samples: what the policy sees, what was done, what it is taken to be worth.
 
     Args:
-        batch: as the learner gets it; newest frame of each view is shown, then that n steps later.
+        batch: as the learner gets it; the newest frame of each view is shown, then that n steps later. Of a large one
+            the samples with a reward come first, two at most.
         path: .png file to write.
     """
-    count = min(SHOWN, len(batch.action))
+    chosen = _chosen(batch.reward.flatten().cpu().numpy())
+    count = len(chosen)
+    batch = _rows(batch, chosen)
     views = [
-        v[:count, -3:]
-        for pair in zip(batch.observation.pixels, batch.next_observation.pixels, strict=True)
-        for v in pair
+        v[:, -3:] for pair in zip(batch.observation.pixels, batch.next_observation.pixels, strict=True) for v in pair
     ]
     numbers = [(batch.action, "action")]
     if batch.observation.low_dim is not None:
@@ -98,6 +100,28 @@ def draw_batch(batch: Batch, path: Path) -> None:
             _bars(draw, values[row].cpu().numpy()[-40:], left + 6, top)
             left += size
     image.save(path)
+
+
+def _chosen(reward: NDArray[Any]) -> NDArray[Any]:
+    """Numbers of the samples to show: up to two with a reward, then the others from both ends of the batch in turn."""
+    rewarded = np.flatnonzero(reward > 0)[:2]
+    others = np.setdiff1d(np.arange(len(reward)), rewarded)
+    fanned = np.stack([others[: len(others) // 2], others[::-1][: len(others) // 2]], axis=1).ravel()
+    rest = fanned if len(reward) > SHOWN else others
+    chosen: NDArray[Any] = np.concatenate([rewarded, rest])[:SHOWN]
+    return chosen
+
+
+def _rows(batch: Batch, chosen: NDArray[Any]) -> Batch:
+    index = torch.from_numpy(chosen)
+
+    def observation(o: Observation) -> Observation:
+        return Observation(tuple(v[index] for v in o.pixels), None if o.low_dim is None else o.low_dim[index])
+
+    return Batch(
+        observation(batch.observation), batch.action[index], batch.reward[index], batch.discount[index],
+        observation(batch.next_observation), batch.demo[index],
+    )  # fmt: skip
 
 
 def _bars(draw: ImageDraw.ImageDraw, values: NDArray[Any], left: int, top: int) -> None:

@@ -173,7 +173,10 @@ class Trainer:
             self.counters.episodes, self.counters.env_steps = place.number + 1, int(place.note["env_steps"])
             owed += place.length * recipe.updates_per_step + recipe.updates_per_episode
         if places:
-            self.monitor.message(f"{len(places)} episodes after the last checkpoint are kept; {owed} updates again.")
+            self.monitor.message(
+                f"{len(places)} episodes that ended after the last checkpoint are kept; their {owed} updates are made "
+                "again."
+            )
         self.updates(owed)
 
     def evaluate(self, phase: str, episodes: int) -> None:
@@ -196,7 +199,7 @@ class Trainer:
             "mean_length": float(np.mean(result.steps)), "mean_return": result.mean_return,
         }  # fmt: skip
         self.metrics.write("evaluations", row | self._progress())
-        self.monitor.message(f"{phase:>8}  step {self.counters.env_steps:>6}  success {result}")
+        self.monitor.message(f"{phase:>8}  step {self.counters.env_steps:>6}  {result}")
 
     def _progress(self) -> dict[str, float]:
         now = time.monotonic()

@@ -68,13 +68,25 @@ def test_a_failed_run_is_named_and_the_others_go_on(
     plan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     content = json.loads(plan.read_text())
-    content["methods"] = {"bad": ["--policy.type=cqn", "--policy.preset=no_such"]}
+    content["methods"] = {"bad": [*TINY_POLICY, "--dataset.root=nowhere"]}
+    content["tasks"] = {"click": [option for option in content["tasks"]["click"] if "dataset.root" not in option]}
     plan.write_text(json.dumps(content))
     assert main([str(plan), f"--output_dir={tmp_path / 'out'}"]) == 2
-    said = capsys.readouterr().out
-    assert f"click / bad / 1 failed: see {tmp_path / 'out/click/bad/1'}.log" in said.replace("\n", "")
+    said = capsys.readouterr().out.replace("\n", "")
+    assert "click / bad / 1 failed: cqn-train: No dataset at nowhere" in said
+    assert f"(log: {tmp_path / 'out/click/bad/1'}.log)" in said
     assert "there is nothing to report" in said
-    assert "no_such" in (tmp_path / "out/click/bad/1.log").read_text()
+
+
+def test_wrong_arguments_of_a_method_are_found_before_any_run(
+    plan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = json.loads(plan.read_text())
+    content["methods"]["bad"] = ["--policy.type=cqn", "--policy.preset=no_such"]
+    plan.write_text(json.dumps(content))
+    assert main([str(plan), f"--output_dir={tmp_path / 'out'}"]) == 2
+    assert "click / bad: Unknown preset 'no_such'" in capsys.readouterr().out
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

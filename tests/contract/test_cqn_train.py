@@ -243,7 +243,7 @@ def assert_refused(arguments: list[str], said: list[str], capfd: pytest.CaptureF
         ("no_action", ["Expected one action vector under 'action'", "found None"]),
         ("no_observation", ["Nothing to observe", "observation.state", "found []"]),
         ("small_action", ["action has 7 dimensions", "4", "use the environment"]),
-        ("camera", ["needs 'observation.images.wrist'", "does not give", "--env.cameras"]),
+        ("camera", ["The dataset has 'observation.images.wrist'", "does not give", "--env.cameras"]),
         ("nan", ["'observation.state'", "episode 1, frame 1", "expected finite numbers", "repair the episode"]),
     ],
 )
@@ -281,7 +281,10 @@ def test_damaged_datasets(
         (["--dataset.episodes=[]"], ["--dataset.episodes=[]", "at least one"]),
         (["--env.type=ur5e_statio"], ["'ur5e_statio'", "Did you mean 'ur5e_station'?"]),
         (["--env.obs_type=state_only"], ["Unknown obs_type 'state_only'", "both, pixels, state"]),
-        (["--env.obs_type=both"], ["has not seen the camera 'observation.images.left_shoulder'", "leave it out"]),
+        (
+            ["--env.obs_type=both"],
+            ["has not the environment's camera 'observation.images.left_sh", "leave it"],
+        ),
         (["--config_path=/nowhere.json"], ["/nowhere.json"]),
         (["--policy.type=act"], ["`preset`", "not valid for ACTConfig"]),
     ],

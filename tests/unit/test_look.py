@@ -29,7 +29,7 @@ def demonstration(seed: int, *, still: float = 0.0, narrow: bool = False, succes
     [
         ({}, None),
         ({"success": False}, "No demonstration ends in success"),
-        ({"narrow": True}, "at its bounds in"),
+        ({"narrow": True}, "Action dimensions at their bounds in many steps: 0 ("),
         ({"still": 0.5}, "of the demonstrated steps stand still"),
     ],
 )
@@ -37,6 +37,12 @@ def test_warnings(options: dict[str, bool | float], said: str | None) -> None:
     found = warnings_about([demonstration(seed, **options) for seed in range(8)])  # type: ignore[arg-type]
     assert len(found) == (said is not None), found
     assert said is None or said in found[0]
+
+
+def test_where_the_environment_ends_nothing_is_lost() -> None:
+    narrow = [demonstration(seed, narrow=True) for seed in range(8)]
+    assert warnings_about(narrow, free=np.array([False, False, True])) == []
+    assert "1 (" in warnings_about(narrow, free=np.array([False, True, True]))[0]
 
 
 def test_no_demonstrations_no_warnings() -> None:

@@ -81,11 +81,11 @@ class AlohaSmallEnv(SimEnvConfig):
         ConfigError: a value that is not one of those named above, or a given feature of another shape.
     """
 
-    task: str | None = "transfer_cube"
-    fps: int = FPS
+    task: str | None = "transfer_cube"  # transfer_cube or insertion
+    fps: int = FPS  # gym_aloha's
     obs_type: str = "pixels"
-    cameras: list[str] = field(default_factory=lambda: ["top"])
-    reward: str = "sparse"
+    cameras: list[str] = field(default_factory=lambda: ["top"])  # the only one
+    reward: str = "sparse"  # 1 at success, or "dense": the stages
 
     def check(self) -> None:
         """Validate what a user may set. Raises ConfigError."""

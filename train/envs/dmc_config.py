@@ -133,10 +133,10 @@ class DMCEnv(SimEnvConfig):
         ConfigError: a value that is not one of those named above, or a given feature of another shape.
     """
 
-    task: str | None = "cartpole-swingup"
-    fps: int = 100
-    cameras: list[str] = field(default_factory=lambda: list(CAMERAS))
-    action_repeat: int | None = None
+    task: str | None = "cartpole-swingup"  # domain-task, e.g. walker-walk or ball_in_cup-catch
+    fps: int = 100  # follows from task and action_repeat
+    cameras: list[str] = field(default_factory=lambda: list(CAMERAS))  # the suite's own
+    action_repeat: int | None = None  # simulator steps an action is held; none: 1 with states, 2 with pictures
 
     def check(self) -> None:
         """Validate what a user may set; fills in fps."""

@@ -45,13 +45,13 @@ class SimEnvConfig(EnvConfig):
         ConfigError: a value out of range, or a given feature of another shape.
     """
 
-    obs_type: str = "state"
+    obs_type: str = "state"  # state (no cameras), pixels (no simulator state) or both
     cameras: list[str] = field(default_factory=list)
-    image_size: int = 84
-    episode_length: int | None = None
-    render_mode: str = "rgb_array"
-    features: dict[str, PolicyFeature] = field(default_factory=dict)
-    features_map: dict[str, str] = field(default_factory=dict)
+    image_size: int = 84  # height and width of each camera's picture, 16 to 1024 pixels
+    episode_length: int | None = None  # control steps before the episode is cut off; none: the task's own
+    render_mode: str = "rgb_array"  # of films
+    features: dict[str, PolicyFeature] = field(default_factory=dict)  # follow from the rest
+    features_map: dict[str, str] = field(default_factory=dict)  # follows from the rest
 
     def __post_init__(self) -> None:
         self.check()

@@ -47,10 +47,10 @@ class HilSimEnv(SimEnvConfig):
         ConfigError: a value that is not one of those named above, or a given feature of another shape.
     """
 
-    task: str | None = "pick_cube"
-    fps: int = FPS
-    random_position: bool = True
-    cameras: list[str] = field(default_factory=lambda: list(CAMERAS))
+    task: str | None = "pick_cube"  # pick_cube or arrange_boxes
+    fps: int = FPS  # gym_hil's
+    random_position: bool = True  # objects placed anew in each episode
+    cameras: list[str] = field(default_factory=lambda: list(CAMERAS))  # front, wrist
 
     def check(self) -> None:
         """Validate what a user may set. Raises ConfigError."""

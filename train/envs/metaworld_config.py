@@ -148,9 +148,9 @@ class MetaworldSparseEnv(SimEnvConfig):
         ConfigError: a value that is not one of those named above, or a given feature of another shape.
     """
 
-    task: str | None = "drawer-open-v3"
-    fps: int = 20
-    cameras: list[str] = field(default_factory=lambda: list(DEFAULT_CAMERAS))
+    task: str | None = "drawer-open-v3"  # one of Meta-World's 50; docs/environments.md lists 20
+    fps: int = 20  # control steps a second: 10, 20, 40 or 80
+    cameras: list[str] = field(default_factory=lambda: list(DEFAULT_CAMERAS))  # or others of Meta-World's six
 
     def check(self) -> None:
         """Validate what a user may set; completes the task's name."""

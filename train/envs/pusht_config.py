@@ -53,11 +53,11 @@ class PushtSmallEnv(SimEnvConfig):
         ConfigError: a value that is not one of those named above, or a given feature of another shape.
     """
 
-    task: str | None = "pusht"
-    fps: int = FPS
+    task: str | None = "pusht"  # the only one
+    fps: int = FPS  # gym_pusht's
     obs_type: str = "pixels"
-    image_size: int = 96
-    reward: str = "sparse"
+    image_size: int = 96  # pixels a side; 96 in the public dataset
+    reward: str = "sparse"  # 1 at success, or "dense": the covered share
 
     def check(self) -> None:
         """Validate what a user may set. Raises ConfigError."""

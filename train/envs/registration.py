@@ -47,9 +47,9 @@ class UR5eStationEnv(SimEnvConfig):
         ConfigError: a value that is not one of those named above, or a given feature of another shape.
     """
 
-    task: str | None = "click_button"
-    fps: int = 10
-    cameras: list[str] = field(default_factory=lambda: list(CAMERAS))
+    task: str | None = "click_button"  # or take_lid_off_saucepan, flip_cup, open_drawer_put_teddy
+    fps: int = 10  # control steps a second: 5, 10, 20, 25 or 50
+    cameras: list[str] = field(default_factory=lambda: list(CAMERAS))  # left/right_shoulder, upper/lower_wrist
 
     def check(self) -> None:
         """Validate what a user may set. Raises ConfigError."""

@@ -49,11 +49,11 @@ class RLBenchEnv(SimEnvConfig):
         ConfigError: a value that is not one of those named above, or a given feature of another shape.
     """
 
-    task: str | None = "take_lid_off_saucepan"
-    fps: int = FPS
-    variation: int = 0
-    obs_type: str = "pixels"
-    cameras: list[str] = field(default_factory=lambda: list(CAMERAS))
+    task: str | None = "take_lid_off_saucepan"  # one of the paper's 20
+    fps: int = FPS  # RLBench's
+    variation: int = 0  # of the task
+    obs_type: str = "pixels"  # the only one
+    cameras: list[str] = field(default_factory=lambda: list(CAMERAS))  # front, wrist, shoulders
 
     def check(self) -> None:
         """Validate what a user may set. Raises ConfigError."""
