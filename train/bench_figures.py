@@ -76,7 +76,8 @@ def draw_table(scores: Mapping[str, NDArray[np.float64]], plan: "Plan", seeds: i
     top = 1.0 if plan.score == "success_rate" else float(max(means.max(), 1e-9))
     axis.imshow(means, cmap="Blues", vmin=0, vmax=2 * top, aspect="auto")  # light enough for black text
     for row, column in np.ndindex(means.shape):
-        text = f"{means[row, column]:.{plan.digits}f} ± {spreads[row, column]:.{plan.digits}f}"
+        text = f"{means[row, column]:.{plan.digits}f}"
+        text += f" ± {spreads[row, column]:.{plan.digits}f}" if seeds > 1 else ""
         best = means[row, column] >= means[:, column].max() - 1e-9
         axis.text(column, row, text, ha="center", va="center", fontsize=9, fontweight="bold" if best else "normal")
     axis.set_xticks(range(len(tasks)), [task.replace("_", " ") for task in tasks], fontsize=9)
@@ -84,7 +85,8 @@ def draw_table(scores: Mapping[str, NDArray[np.float64]], plan: "Plan", seeds: i
     axis.xaxis.tick_top()
     axis.tick_params(length=0)
     axis.spines[:].set_visible(False)
-    axis.set_xlabel(f"{_name(plan)}, mean ± standard deviation over {seeds} seeds", fontsize=9)
+    over = f"mean ± standard deviation over {seeds} seeds" if seeds > 1 else "one seed"
+    axis.set_xlabel(f"{_name(plan)}, {over}", fontsize=9)
     figure.savefig(path, dpi=130)
 
 

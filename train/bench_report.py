@@ -106,16 +106,23 @@ def _markdown(
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     for method, values in scores.items():
         pairs = zip(values.mean(axis=0), spread(values), strict=True)
-        cells = [f"{m:.{digits}f} ± {s:.{digits}f}" for m, s in pairs]
+        # One seed says nothing of the spread over seeds: no figure is better than a zero.
+        cells = [f"{m:.{digits}f}" + (f" ± {s:.{digits}f}" if len(seeds) > 1 else "") for m, s in pairs]
         versus = "{:.2f} ({:.2f}-{:.2f})".format(*better[method]) if method in better else ""
         middle = "{:.{d}f} ({:.{d}f}-{:.{d}f})".format(*iqm[method], d=digits)
+        middle, versus = (middle, versus) if len(seeds) > 1 else (f"{iqm[method][0]:.{digits}f}", "")
         lines.append(f"| {method} | {' | '.join(cells)} | {middle} | {versus} |")
     what = plan.score.replace("_", " ")
+    spread_over = (
+        "mean ± standard deviation over seeds; interquartile mean over seeds and tasks, and probability of improvement"
+        " with 95 % stratified bootstrap intervals."
+        if len(seeds) > 1
+        else "a single run of each method, so nothing is known of the spread over seeds."
+    )
     lines += [
         "",
         f"{what.capitalize()} of the deterministic policy at the end, {'/'.join(sorted(n))} evaluation episodes a run,"
-        f" seeds {', '.join(map(str, seeds))}: mean ± standard deviation over seeds; interquartile mean over seeds and"
-        " tasks, and probability of improvement with 95 % stratified bootstrap intervals.",
+        f" seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}: {spread_over}",
     ]
     return "\n".join(lines) + "\n"
 
