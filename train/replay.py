@@ -3,7 +3,7 @@
 import json
 from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -162,6 +162,34 @@ class Replay:
         self._keep(place)
         self._head = place.stop
 
+    def relabel(self, number: int, *, success: bool, demo: bool) -> bool:
+        """Say otherwise how an episode of the run went: its last reward becomes 1 or 0, and it ends there either way.
+
+        Returns whether the episode is still here. demo: whether it counts as a demonstration from now on.
+        """
+        index = self._index(number)
+        if index is None:
+            return False
+        place = self._places[index]
+        place = replace(place, terminated=True, success=success, demo=demo, note={**place.note, "relabelled": True})
+        if self._journal is not None:
+            self._journal.complete(place)
+        self._label_reward(place)
+        self._places[index] = place
+        self._tables = {}
+        return True
+
+    def forget(self, number: int) -> bool:
+        """Never sample an episode of the run again; returns whether it was still here."""
+        index = self._index(number)
+        if index is None:
+            return False
+        place = self._places.pop(index)
+        if self._journal is not None:
+            self._journal.announce(place.start, place.stop)
+        self._tables = {}
+        return True
+
     def sample(self, count: int, demo_count: int, rng: np.random.Generator) -> Batch:
         """`count` transitions from everything followed by `demo_count` from the demonstrations.
 
@@ -272,6 +300,14 @@ class Replay:
         if len(kept) < len(self._places):
             self._places, self._tables = kept, {}
 
+    def _index(self, number: int) -> int | None:
+        """Where the run's episode of that number stands among the places."""
+        return next((i for i in range(self._fixed, self.episodes) if self._places[i].number == number), None)
+
+    def _label_reward(self, place: Place) -> None:
+        last = place.start + place.length - 1
+        self._rows["reward"].write(last, np.array([float(place.success)], np.float32))
+
     def _keep(self, place: Place) -> None:
         self._places.append(place)
         self._tables = {}
@@ -307,12 +343,20 @@ class Replay:
             )
         self._journal.repair()
         for (start, stop), place in self._journal.entries():
+            relabelled = place is not None and "relabelled" in place.note
+            index = self._index(place.number) if place is not None and relabelled else None
+            if place is not None and index is not None:
+                self._places[index] = place
+                continue
             self._evict(start, stop)
             if place is not None:
                 self._keep(place)
                 self._head = place.stop
         if written is not None:
             self._restore(written)
+        for place in self._places[self._fixed :]:
+            if "relabelled" in place.note:  # a kill may have come between the label and its reward
+                self._label_reward(place)
         return self._places[self._fixed :]
 
     def _restore(self, written: dict[str, Any]) -> None:

@@ -103,7 +103,7 @@ class Journal:
         self._append({"writing": [start, stop]})
 
     def complete(self, place: Place) -> None:
-        """The announced rows hold this episode."""
+        """The announced rows hold this episode, or one that is there is now described so."""
         self._append({"episode": asdict(place)})
 
     def repair(self) -> None:
@@ -129,7 +129,7 @@ class Journal:
                 raise DataError(
                     f"{self.path}, line {number} is damaged: the replay cannot be resumed; start a new run."
                 ) from error
-            if announced is not None and place is None:
+            if announced is not None and announced != rows:
                 yield announced, None
             announced = rows if place is None else None
             if place is not None:

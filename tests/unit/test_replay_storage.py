@@ -188,3 +188,61 @@ def test_a_first_episode_that_is_refused_decides_nothing() -> None:
         replay.add(bad, demo=True)
     replay.add(Episode(None, (), np.zeros((2, 1), np.float32), np.zeros(2, np.float32), False, False), demo=False)
     assert replay.episodes == 1
+
+
+def run_of(folder: Path | None, count: int = 4) -> Replay:
+    """A demonstration, then `count` failed episodes of the run, numbered from 0."""
+    replay = small(folder, 10_000)
+    for number in range(count):
+        replay.add(make_episode(number + 1, 5 + number, views=1, terminated=False), demo=False, number=number)
+    return replay
+
+
+def at_the_end(replay: Replay, episode: int, length: int) -> set[tuple[float, float]]:
+    """Reward and discount of the samples of an episode's last step."""
+    batch = replay.sample(3000, 0, np.random.default_rng(0))
+    rows = [row for row in range(3000) if locate(batch, row) == (episode, length - 1)]
+    return {(float(batch.reward[row]), round(float(batch.discount[row]), 3)) for row in rows}
+
+
+@pytest.mark.parametrize("reopened", [False, True])
+def test_an_episode_that_is_relabelled_earns_its_reward_and_ends(tmp_path: Path, reopened: bool) -> None:
+    replay = run_of(tmp_path)
+    assert replay.demonstrations == 1
+    assert replay.relabel(2, success=True, demo=True)
+    assert replay.relabel(1, success=True, demo=True)
+    assert replay.relabel(1, success=False, demo=False)  # a second thought
+    if reopened:
+        replay = small(tmp_path, 10_000)
+        assert [(p.number, p.success, p.terminated) for p in replay.reopen()] == [
+            (0, False, False), (1, False, True), (2, True, True), (3, False, False),
+        ]  # fmt: skip
+    assert replay.demonstrations == 2
+    assert at_the_end(replay, 3, 7) == {(1.0, 0.0)}
+    assert at_the_end(replay, 2, 6) == {(0.0, 0.0)}
+    assert {discount for _, discount in at_the_end(replay, 4, 8)} == {GAMMA}  # only cut off, as before
+    replay.add(make_episode(9, 5, views=1), demo=False, number=4)
+    assert stored(replay) == {0, 1, 2, 3, 4, 9}
+
+
+@pytest.mark.parametrize("reopened", [False, True])
+def test_an_episode_that_is_forgotten_is_not_sampled_again(tmp_path: Path, reopened: bool) -> None:
+    replay = run_of(tmp_path)
+    assert replay.forget(1)
+    assert not replay.forget(1)
+    assert not replay.relabel(1, success=True, demo=True)
+    assert replay.relabel(3, success=True, demo=True)  # right after it in the journal
+    if reopened:
+        replay = small(tmp_path, 10_000)
+        replay.reopen()
+    assert stored(replay) == {0, 1, 3, 4}
+    replay.add(make_episode(9, 5, views=1), demo=False, number=4)
+    assert stored(replay) == {0, 1, 3, 4, 9}
+
+
+def test_what_has_made_room_cannot_be_relabelled() -> None:
+    replay = small(None, 14)
+    for number in range(4):
+        replay.add(make_episode(number + 1, 3, views=1), demo=False, number=number)
+    assert not replay.relabel(0, success=True, demo=True)
+    assert replay.relabel(3, success=True, demo=True)
