@@ -155,19 +155,14 @@ class DMCEnv(SimEnvConfig):
         return Sizes(task.action, 0 if self.obs_type == "pixels" else task.state, 0)
 
     @property
-    def package_name(self) -> str:
-        """Module whose import registers the environment with gymnasium."""
-        return __name__
-
-    @property
     def gym_id(self) -> str:
         """Name of the environment in gymnasium's registry."""
         return gym_id(str(self.task))
 
     @property
-    def max_episode_steps(self) -> int:
-        """Control steps before an episode is cut off."""
-        return SUITE_STEPS // self.repeat if self.episode_length is None else self.episode_length
+    def usual_steps(self) -> int:
+        """Control steps before an episode of the task is cut off, where the user does not say."""
+        return SUITE_STEPS // self.repeat
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

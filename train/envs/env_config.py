@@ -79,11 +79,21 @@ class SimEnvConfig(EnvConfig):
         raise NotImplementedError
 
     @property
-    def max_episode_steps(self) -> int:
-        """Control steps before an episode is cut off."""
+    def usual_steps(self) -> int:
+        """Control steps before an episode of the task is cut off, where the user does not say."""
         raise NotImplementedError
 
     # -- what follows ----------------------------------------------------------------------------------------
+
+    @property
+    def package_name(self) -> str:
+        """Module whose import registers the environment with gymnasium."""
+        return type(self).__module__
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Control steps before an episode is cut off."""
+        return self.usual_steps if self.episode_length is None else self.episode_length
 
     @property
     def shown_cameras(self) -> list[str]:

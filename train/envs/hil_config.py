@@ -64,19 +64,14 @@ class HilSimEnv(SimEnvConfig):
         return Sizes(4, STATE_SIZE, 0 if self.obs_type == "pixels" else 3 * len(TASKS[str(self.task)].objects))
 
     @property
-    def package_name(self) -> str:
-        """Module whose import registers the environment with gymnasium."""
-        return __name__
-
-    @property
     def gym_id(self) -> str:
         """Name of the environment in gymnasium's registry."""
         return _gym_id(str(self.task))
 
     @property
-    def max_episode_steps(self) -> int:
-        """Control steps before an episode is cut off."""
-        return self.episode_length or TASKS[str(self.task)].max_episode_steps
+    def usual_steps(self) -> int:
+        """Control steps before an episode of the task is cut off, where the user does not say."""
+        return TASKS[str(self.task)].max_episode_steps
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

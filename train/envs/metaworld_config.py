@@ -163,19 +163,14 @@ class MetaworldSparseEnv(SimEnvConfig):
         return Sizes(4, 4, 0 if self.obs_type == "pixels" else state_size(str(self.task)))
 
     @property
-    def package_name(self) -> str:
-        """Module whose import registers the environment with gymnasium."""
-        return __name__
-
-    @property
     def gym_id(self) -> str:
         """Name of the environment in gymnasium's registry."""
         return gym_id(str(self.task))
 
     @property
-    def max_episode_steps(self) -> int:
-        """Control steps before an episode is cut off."""
-        return HORIZON_S * self.fps if self.episode_length is None else self.episode_length
+    def usual_steps(self) -> int:
+        """Control steps before an episode of the task is cut off, where the user does not say."""
+        return HORIZON_S * self.fps
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

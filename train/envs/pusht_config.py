@@ -73,19 +73,14 @@ class PushtSmallEnv(SimEnvConfig):
         return Sizes(2, 2, 0 if self.obs_type == "pixels" else KEYPOINTS)
 
     @property
-    def package_name(self) -> str:
-        """Module whose import registers the environment with gymnasium."""
-        return __name__
-
-    @property
     def gym_id(self) -> str:
         """Name of the environment in gymnasium's registry."""
         return GYM_ID
 
     @property
-    def max_episode_steps(self) -> int:
-        """Control steps before an episode is cut off."""
-        return self.episode_length or LIMIT
+    def usual_steps(self) -> int:
+        """Control steps before an episode of the task is cut off, where the user does not say."""
+        return LIMIT
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

@@ -61,20 +61,13 @@ class UR5eStationEnv(SimEnvConfig):
         return Sizes(7, 7, 0 if self.obs_type == "pixels" else len(TASKS[str(self.task)].state_names))
 
     @property
-    def package_name(self) -> str:
-        """Module whose import registers the environment with gymnasium."""
-        return __name__
-
-    @property
     def gym_id(self) -> str:
         """Name of the environment in gymnasium's registry."""
         return gym_id(str(self.task))
 
     @property
-    def max_episode_steps(self) -> int:
-        """Control steps before an episode is cut off."""
-        if self.episode_length is not None:
-            return self.episode_length
+    def usual_steps(self) -> int:
+        """Control steps before an episode of the task is cut off, where the user does not say."""
         return TASKS[str(self.task)].max_episode_steps * self.fps // 10
 
     @property

@@ -67,19 +67,14 @@ class RLBenchEnv(SimEnvConfig):
         return Sizes(8, 8, 0)
 
     @property
-    def package_name(self) -> str:
-        """Module whose import registers the environment with gymnasium."""
-        return __name__
-
-    @property
     def gym_id(self) -> str:
         """Name of the environment in gymnasium's registry."""
         return _gym_id(str(self.task))
 
     @property
-    def max_episode_steps(self) -> int:
-        """Control steps before an episode is cut off."""
-        return self.episode_length or TASKS[str(self.task)]
+    def usual_steps(self) -> int:
+        """Control steps before an episode of the task is cut off, where the user does not say."""
+        return TASKS[str(self.task)]
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
