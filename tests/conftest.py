@@ -6,6 +6,7 @@ All are environment variables, set before torch, LeRobot or MuJoCo is imported: 
 import ctypes
 import os
 import shutil
+import signal
 import sys
 import tempfile
 
@@ -14,6 +15,10 @@ import pytest
 
 hypothesis.settings.register_profile("cqn", deadline=None)  # a busy machine is no failure
 hypothesis.settings.load_profile("cqn")
+
+# Started in the background of a shell, this process and all it starts would ignore Ctrl-C, which tests press.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 _WORKER = "PYTEST_XDIST_WORKER" in os.environ  # a worker inherits the folder of the process that started it
 _HOME = os.environ["HF_HOME"] if _WORKER else tempfile.mkdtemp(prefix="cqn-tests-")

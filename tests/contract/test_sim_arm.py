@@ -208,5 +208,5 @@ def test_lerobot_record_mirrors_the_leader(tmp_path: Path) -> None:
     assert action.shape[1] == 7
     # The arm follows the leader: where it is sent is where it is a few steps later, and it travels far.
     first = (rows["episode_index"] == 0).to_numpy()
-    assert np.median(np.abs(action[first][:-4, :6] - state[first][4:, :6])) < 1
+    assert np.median(np.abs(action[first][:-4, :6] - state[first][4:, :6])) < 3  # degrees
     assert np.ptp(action[first][:, :6], axis=0).max() > 5
