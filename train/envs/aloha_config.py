@@ -83,8 +83,8 @@ class AlohaSmallEnv(SimEnvConfig):
 
     task: str | None = "transfer_cube"  # transfer_cube or insertion
     fps: int = FPS  # gym_aloha's
-    obs_type: str = "pixels"
-    cameras: list[str] = field(default_factory=lambda: ["top"])  # the only one
+    obs_type: str = "pixels"  # state, pixels or both
+    cameras: list[str] = field(default_factory=lambda: ["top"])  # or angle, front_close, left_wrist, right_wrist
     reward: str = "sparse"  # 1 at success, or "dense": the stages
 
     def check(self) -> None:

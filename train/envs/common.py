@@ -1,4 +1,4 @@
-"""What the environments around other people's simulators share: lean pictures and checked actions."""
+"""What the environments share: lean pictures of other people's models, checked actions, observation spaces."""
 
 from collections.abc import Sequence
 from typing import Any

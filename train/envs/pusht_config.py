@@ -55,7 +55,7 @@ class PushtSmallEnv(SimEnvConfig):
 
     task: str | None = "pusht"  # the only one
     fps: int = FPS  # gym_pusht's
-    obs_type: str = "pixels"
+    obs_type: str = "pixels"  # state, pixels or both
     image_size: int = 96  # pixels a side; 96 in the public dataset
     reward: str = "sparse"  # 1 at success, or "dense": the covered share
 

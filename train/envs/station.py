@@ -6,9 +6,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_cqn.errors import ConfigError, DataError, one_of
+from lerobot_cqn.errors import ConfigError, one_of
 
 from .cameras import Cameras
+from .common import RENDER_SIZE, checked_action
 from .env_config import check_cameras
 from .tasks import TASKS
 from .ur5e import HOME, STATE_NAMES, TIMESTEP, Arm
@@ -16,13 +17,12 @@ from .ur5e import HOME, STATE_NAMES, TIMESTEP, Arm
 if TYPE_CHECKING:
     from .expert import ScriptedTeleoperator
 
-__all__ = ["CAMERAS", "MAX_JOINT_SPEED", "UR5eStation"]
+__all__ = ["CAMERAS", "LEASH", "MAX_JOINT_SPEED", "UR5eStation"]
 
 CAMERAS = ("left_shoulder", "right_shoulder", "upper_wrist", "lower_wrist")
 MAX_JOINT_SPEED = 1.0  # rad/s
-_LEASH = 0.25  # rad, how far the command may run ahead of the measured joint
+LEASH = 0.25  # rad, how far the command may run ahead of the measured joint
 _HOME_SPREAD = 0.03  # rad, of each joint at the start
-_RENDER_SIZE = (360, 480)  # height, width of `render()`
 
 Observation = dict[str, Any]
 
@@ -111,9 +111,9 @@ class UR5eStation(gym.Env[Observation, NDArray[np.float32]]):
         Raises:
             DataError: the action is not seven finite numbers.
         """
-        checked = self._checked(action)
+        checked = checked_action(action, self.action_space, self.action_names)
         measured = self._arm.joints
-        wanted: NDArray[np.float64] = np.clip(self._command + checked[:6], measured - _LEASH, measured + _LEASH)
+        wanted: NDArray[np.float64] = np.clip(self._command + checked[:6], measured - LEASH, measured + LEASH)
         wanted = self._arm.clip(wanted)
         self._arm.drive(self._command, wanted, float(checked[6]), self._substeps)
         self._command = wanted
@@ -122,7 +122,7 @@ class UR5eStation(gym.Env[Observation, NDArray[np.float32]]):
 
     def render(self) -> NDArray[np.uint8]:
         """The whole station, (360, 480, 3) uint8 RGB."""
-        return self._cameras.picture(self._arm.data, "overview", *_RENDER_SIZE, oversample=2)
+        return self._cameras.picture(self._arm.data, "overview", *RENDER_SIZE, oversample=2)
 
     def close(self) -> None:
         """Release graphics contexts; calling it twice is harmless."""
@@ -145,15 +145,6 @@ class UR5eStation(gym.Env[Observation, NDArray[np.float32]]):
     def station_task(self) -> Any:
         """The running task (`task.Task`)."""
         return self._task
-
-    def _checked(self, action: Any) -> NDArray[np.float64]:
-        values = np.asarray(action, dtype=np.float64)
-        if values.shape != (7,):
-            raise DataError(f"Action has shape {values.shape}: expected (7,), {', '.join(self.action_names)}.")
-        if not np.isfinite(values).all():
-            bad = self.action_names[int(np.flatnonzero(~np.isfinite(values))[0])]
-            raise DataError(f"Action is not finite at '{bad}': expected seven finite numbers.")
-        return np.clip(values, self.action_space.low, self.action_space.high)
 
     def _observe(self) -> Observation:
         joints = np.append(self._arm.joints, self._arm.closure).astype(np.float32)

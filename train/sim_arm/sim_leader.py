@@ -8,10 +8,11 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from numpy.typing import NDArray
 
 from ..envs.expert import ScriptedTeleoperator
+from ..envs.station import MAX_JOINT_SPEED
 from ..envs.ur5e import HOME, STATE_NAMES
 from .config_sim_leader import SimLeaderConfig
 from .sim_ur5e import to_robot_units
-from .world import MAX_JOINT_SPEED, World, find_world
+from .world import World, find_world
 
 __all__ = ["SimLeader"]
 
@@ -112,7 +113,7 @@ class SimLeader(Teleoperator):
                 self._enter("hold", world)
                 return
             action = self._person.act()
-            self._joints = self._leashed(world, self._joints + action[:6])
+            self._joints = world.leashed(self._joints + action[:6])
             self._closure = float(action[6])
         elif self.phase == "hold" and held >= self.config.hold_s:
             self._enter("home", world)
@@ -128,8 +129,3 @@ class SimLeader(Teleoperator):
         elif self.phase == "wait" and held >= self.config.hold_s:
             self._person.reset(self.config.seed + self._scene)
             self._enter("task", world)
-
-    def _leashed(self, world: World, joints: NDArray[np.float64]) -> NDArray[np.float64]:
-        measured = world.arm.joints
-        leashed: NDArray[np.float64] = world.arm.clip(np.clip(joints, measured - 0.25, measured + 0.25))
-        return leashed

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.errors import ConfigError
 
+from ..envs.tasks import TASKS
 from ..envs.ur5e import STATE_NAMES
 from .config_sim_ur5e import SimUR5eConfig
 from .world import WORLDS, World
@@ -129,8 +130,6 @@ class SimUR5e(Robot):
         self._world = None
 
     def _object_names(self) -> tuple[str, ...]:
-        from ..envs.tasks import TASKS
-
         return tuple(f"object.{name}" for name in TASKS[self.config.task].state_names)
 
     def _pictures(self, world: World) -> dict[str, NDArray[np.uint8]]:
@@ -148,5 +147,4 @@ class SimUR5e(Robot):
     def _fail(self, *kinds: str) -> None:
         for kind in kinds:
             if self._on(kind):
-                kinds_of_error = {"error": RuntimeError}
-                raise kinds_of_error.get(kind, ConnectionError)(f"{self}: injected fault '{kind}'.")
+                raise (RuntimeError if kind == "error" else ConnectionError)(f"{self}: injected fault '{kind}'.")

@@ -5,12 +5,14 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_cqn.errors import ConfigError, one_of
 
 from ..envs.cameras import Cameras
+from ..envs.station import LEASH, MAX_JOINT_SPEED
 from ..envs.tasks import TASKS
 from ..envs.ur5e import HOME, TIMESTEP, Arm
 
@@ -18,12 +20,10 @@ __all__ = ["WORLDS", "World", "find_world"]
 
 Array = NDArray[np.float64]
 
-MAX_JOINT_SPEED = 1.0  # rad/s, of the leader
 _AT_HOME = 0.05  # rad of every joint
 _MOVED = 0.3  # rad of any joint: the arm has left home
 _REST_S = 0.3  # seconds at home before the person lays the scene out anew
 _BEHIND_S = 0.5  # most real seconds that are caught up at once; a process that slept longer lost the rest
-_LEASH = 0.25  # rad, how far the command may run ahead of the measured joint
 
 WORLDS: dict[str, "World"] = {}
 
@@ -41,7 +41,8 @@ class World:
     A person lays the scene out anew whenever the arm, after it was away, rests at home.
 
     Attributes:
-        arm, task: of the station; fps: the leader's rate, 1/s of the simulated clock.
+        arm, task: of the station; fps: the leader's rate, 1/s of the simulated clock; action_space: deltas of a step
+            at that rate, and the gripper.
         now: simulated seconds since the start; scenes: how many have been laid out.
         fastest: highest joint speed so far, rad/s, and lowest, highest: joint angles so far, rad; measured in every
             physics step, to check safety limits against.
@@ -54,6 +55,8 @@ class World:
         self.arm = Arm(self.task.mjcf())
         self.cameras = Cameras(self.arm.model)
         self.lock = threading.RLock()
+        limits = np.array([MAX_JOINT_SPEED / self.fps] * 6 + [1.0], np.float32)
+        self.action_space = gym.spaces.Box(np.append(-limits[:6], np.float32(0.0)), limits, dtype=np.float32)
         self.speed, self.ramp_s = speed, ramp_s
         self.now, self.scenes = 0.0, 0
         self._stuck: tuple[int, float] | None = None
@@ -74,14 +77,6 @@ class World:
     def station_task(self) -> Any:
         """The running task."""
         return self.task
-
-    @property
-    def action_space(self) -> Any:
-        """Deltas of a step at `fps`, and the gripper."""
-        import gymnasium as gym
-
-        limits = np.array([MAX_JOINT_SPEED / self.fps] * 6 + [1.0], np.float32)
-        return gym.spaces.Box(np.append(-limits[:6], np.float32(0.0)), limits, dtype=np.float32)
 
     @property
     def success(self) -> bool:
@@ -109,10 +104,14 @@ class World:
         """Lead the joints (6,) rad to a goal within `ramp_s`, and the gripper, 0 (open) to 1 (closed)."""
         with self.lock:
             self.catch_up()
-            measured = self.arm.joints
             self._start = self._reference
-            self._goal = self.arm.clip(np.clip(joints, measured - _LEASH, measured + _LEASH))
+            self._goal = self.leashed(joints)
             self._closure, self._since = float(np.clip(closure, 0.0, 1.0)), 0.0
+
+    def leashed(self, joints: Array) -> Array:
+        """The nearest joints (6,) rad within the limits and within reach of the measured ones."""
+        measured = self.arm.joints
+        return self.arm.clip(np.clip(joints, measured - LEASH, measured + LEASH))
 
     def jam(self, joint: int | None) -> None:
         """Keep a joint where it is from now on, whatever it is told; None lets go."""
