@@ -15,7 +15,8 @@ from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import StreamingVideoEncoder
 
-from lerobot_cqn.errors import ConfigError, DataError, OutputError, OutputExistsError
+from lerobot_cqn.errors import ConfigError, OutputError, OutputExistsError
+from lerobot_cqn.schema import HISTORY, read_history
 
 from .console import note
 
@@ -31,7 +32,6 @@ __all__ = [
     "write_history",
 ]
 
-HISTORY = Path("meta") / "cqn_history.json"
 ENCODER_THREADS = 2  # for each camera; the encoder's memory grows with them, up to gigabytes on many cores
 CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
 
@@ -179,22 +179,6 @@ def new_dataset(
                     dataset.writer.cancel_pending_videos()
                 with contextlib.suppress(Exception):
                     dataset.finalize()
-
-
-def read_history(folder: Path) -> list[dict[str, Any]]:
-    """Operations in a dataset's ``meta/cqn_history.json``, oldest first; none where there is no such file.
-
-    Raises:
-        DataError: the file is damaged.
-    """
-    path = folder / HISTORY
-    if not path.is_file():
-        return []
-    try:
-        operations = json.loads(path.read_text())["operations"]
-        return [dict(entry) for entry in operations]
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path} is damaged ({error!r}): mend it, or remove it to lose the history.") from error
 
 
 def write_history(folder: Path, operations: Sequence[Mapping[str, Any]]) -> None:

@@ -68,6 +68,10 @@ class RLPolicy(PreTrainedPolicy):
         """Forget the frame history; call at the start of each episode."""
         self._queue.clear()
 
+    def forget_newest(self) -> None:
+        """Forget the last frame that was observed; another one takes its place."""
+        self._queue.pop()
+
     def observe(self, batch: dict[str, Tensor]) -> Observation:
         """Push one frame [B, ...] per feature and return the stacked history; the first frame is repeated.
 

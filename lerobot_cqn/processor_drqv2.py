@@ -17,5 +17,4 @@ def make_drqv2_pre_post_processors(
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
     """See `processors.make_processors`."""
-    del dataset_meta
-    return make_processors(config, dataset_stats)
+    return make_processors(config, dataset_stats, dataset_meta)

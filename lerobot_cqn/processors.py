@@ -13,6 +13,7 @@ from lerobot.processor import (
     ObservationProcessorStep,
     PolicyAction,
     PolicyProcessorPipeline,
+    ProcessorStep,
     ProcessorStepRegistry,
     RenameObservationsProcessorStep,
     UnnormalizerProcessorStep,
@@ -28,6 +29,8 @@ from lerobot.utils.constants import (
 
 from .base_config import RLConfig
 from .errors import DataError
+from .fit_pictures import FitPicturesProcessorStep
+from .joint_goals import DeltaToGoalProcessorStep, RememberJointsProcessorStep, converted_deltas
 from .schema import BOUND_PROCESSOR
 
 __all__ = ["BoundObservationProcessorStep", "Stats", "make_processors", "scaling_stats"]
@@ -90,7 +93,7 @@ def scaling_stats(stats: Stats, margin: float, *, inverse: bool) -> Stats:
 
 
 def make_processors(
-    config: RLConfig, dataset_stats: Stats | None = None
+    config: RLConfig, dataset_stats: Stats | None = None, dataset_meta: Any = None
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
@@ -98,7 +101,13 @@ def make_processors(
     """Pipelines around the policy, under the step names LeRobot overrides by.
 
     dataset_stats: LeRobot's statistics (`min`, `max`, `mean`, `std` per feature); None leaves values as they are.
+    dataset_meta: LeRobot's metadata of the dataset; where its absolute actions were turned into deltas, the pipelines
+        turn the policy's back into absolute goals. By default the one that the policy was made for.
+    Raises DataError where the dataset's history is damaged.
     """
+    # lerobot-train hands the metadata to `make_policy` only, which leaves it here.
+    meta = getattr(config, "_runtime_dataset_meta", None) if dataset_meta is None else dataset_meta
+    remember, to_goal = _goal_steps(meta)
     stats = _tensors_to_numpy(dataset_stats or {})
     margin = config.settings.action_margin
     features: dict[str, PolicyFeature] = {**(config.input_features or {}), **(config.output_features or {})}
@@ -107,6 +116,8 @@ def make_processors(
         steps=[
             RenameObservationsProcessorStep(rename_map={}),
             AddBatchDimensionProcessorStep(),
+            *remember,
+            *_picture_steps(features),
             DeviceProcessorStep(device=config.device),
             NormalizerProcessorStep(
                 features=features,
@@ -125,6 +136,7 @@ def make_processors(
                 norm_map=norm_map,
                 stats=scaling_stats(stats, margin, inverse=True),
             ),
+            *to_goal,
             DeviceProcessorStep(device="cpu"),
         ],
         name=POLICY_POSTPROCESSOR_DEFAULT_NAME,
@@ -132,6 +144,19 @@ def make_processors(
         to_output=transition_to_policy_action,
     )
     return pre, post
+
+
+def _goal_steps(dataset_meta: Any) -> tuple[list[ProcessorStep], list[ProcessorStep]]:
+    deltas = converted_deltas(dataset_meta)
+    if deltas is None:
+        return [], []
+    remember = RememberJointsProcessorStep()
+    return [remember], [DeltaToGoalProcessorStep(deltas.kind, deltas.action_dims, deltas.state_dims, remember)]
+
+
+def _picture_steps(features: dict[str, PolicyFeature]) -> list[ProcessorStep]:
+    shapes = {key: f.shape for key, f in features.items() if f.type is FeatureType.VISUAL and len(f.shape) == 3}
+    return [FitPicturesProcessorStep(shapes)] if shapes else []
 
 
 def _tensors_to_numpy(stats: Stats) -> Stats:

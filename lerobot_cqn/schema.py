@@ -13,20 +13,29 @@ Shape legend, used in every comment on shapes:
     n  length of the n-step return
 """
 
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from math import prod
+from pathlib import Path
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
+from .errors import DataError
+
 __all__ = [
     "ACTION",
     "BOUND_PROCESSOR",
+    "HISTORY",
     "NEXT_DONE",
     "NEXT_REWARD",
     "NEXT_SUCCESS",
     "Batch",
     "Observation",
+    "dimension_names",
+    "read_history",
 ]
 
 ACTION = "action"
@@ -34,6 +43,7 @@ NEXT_REWARD = "next.reward"
 NEXT_DONE = "next.done"
 NEXT_SUCCESS = "next.success"
 BOUND_PROCESSOR = "cqn_bound_observation_processor"
+HISTORY = Path("meta") / "cqn_history.json"  # in a dataset's folder: what was done to it
 
 
 @dataclass(frozen=True)
@@ -81,3 +91,33 @@ class Batch:
             self.next_observation.to(device),
             self.demo.to(device, non_blocking=True),
         )
+
+
+def read_history(folder: Path) -> list[dict[str, Any]]:
+    """Operations in a dataset's ``meta/cqn_history.json``, oldest first; none where there is no such file.
+
+    Raises:
+        DataError: the file is damaged.
+    """
+    path = folder / HISTORY
+    if not path.is_file():
+        return []
+    try:
+        operations = json.loads(path.read_text())["operations"]
+        return [dict(entry) for entry in operations]
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path} is damaged ({error!r}): mend it, or remove it to lose the history.") from error
+
+
+def dimension_names(feature: Mapping[str, Any]) -> list[str]:
+    """Names of a vector's dimensions, whichever way the recorder nested them; numbers where there are none."""
+
+    def flat(names: Any) -> list[str]:
+        if isinstance(names, str):
+            return [names]
+        inner = names.values() if isinstance(names, Mapping) else names if isinstance(names, Sequence) else ()
+        return [name for value in inner for name in flat(value)]
+
+    size = prod(feature["shape"])
+    names = flat(feature.get("names") or ())
+    return names if len(names) == size else [str(i) for i in range(size)]

@@ -6,13 +6,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.processor import PolicyProcessorPipeline
+from lerobot.processor import (
+    NormalizerProcessorStep,
+    PolicyProcessorPipeline,
+    TransitionKey,
+    UnnormalizerProcessorStep,
+    create_transition,
+)
 from numpy.typing import NDArray
 
 from lerobot_cqn.base_policy import RLPolicy
 from lerobot_cqn.errors import DataError
+from lerobot_cqn.joint_goals import DeltaJoints, DeltaToGoalProcessorStep
 
-from .interfaces import Frame
+from .interfaces import Frame, Outcome
 from .replay import Episode
 
 __all__ = ["Agent", "Recorder"]
@@ -31,6 +38,47 @@ class Agent:
         prepared: Frame = self.preprocessor(dict(frame))
         return prepared
 
+    def reset(self) -> None:
+        """Forget the episode before: frames, and joints that commands are differences from."""
+        self.policy.reset()
+        self.preprocessor.reset()
+        self.postprocessor.reset()
+
+    def retake(self, *, first: bool) -> None:
+        """Forget the newest frame, which another one takes the place of; first: of the episode."""
+        if first:
+            self.policy.reset()
+        else:
+            self.policy.forget_newest()
+
+    def carried_out(self, action: torch.Tensor, outcome: Outcome) -> torch.Tensor:
+        """The normalised action [1, D] that was carried out in a step for which `action` was chosen.
+
+        What limits changed of the policy's action belongs to the world; a person's command is an action of its own.
+        """
+        if outcome.sent is None:
+            for step in self._goal_steps if outcome.skipped else ():
+                step.sent(None)
+            return action
+        wanted = outcome.sent
+        for step in self._goal_steps:
+            wanted = step.action_of(outcome.sent)
+            step.sent(outcome.sent)
+        if not outcome.taught:
+            return action
+        (normaliser,) = (s for s in self.preprocessor.steps if isinstance(s, NormalizerProcessorStep))
+        scaled: torch.Tensor = normaliser(create_transition(action=wanted.float()))[TransitionKey.ACTION]
+        return scaled.clamp(-1.0, 1.0).to(action)
+
+    @property
+    def deltas(self) -> DeltaJoints | None:
+        """Which of the policy's actions are differences that the postprocessor turns into goals; None: none."""
+        return next((step.deltas for step in self._goal_steps), None)
+
+    @property
+    def _goal_steps(self) -> list[DeltaToGoalProcessorStep]:
+        return [step for step in self.postprocessor.steps if isinstance(step, DeltaToGoalProcessorStep)]
+
     def act(self, prepared: Frame, *, explore: bool) -> tuple[torch.Tensor, float]:
         """Normalised action [1, D] in [-1, 1] and its mean Q (nan when not exploring)."""
         if explore:
@@ -46,7 +94,9 @@ class Agent:
 
     def inside(self, bounds: Mapping[str, NDArray[Any]] | None) -> NDArray[Any]:
         """Which action dimensions [D] end before the environment's bounds (`min`, `max`) do: more is possible."""
-        extremes = [self.postprocessor(torch.full((1, self.policy.action_dims), end))[0].numpy() for end in (-1.0, 1.0)]
+        (scale,) = (step for step in self.postprocessor.steps if isinstance(step, UnnormalizerProcessorStep))
+        ends = [torch.full((1, self.policy.action_dims), end) for end in (-1.0, 1.0)]
+        extremes = [scale(create_transition(action=end))[TransitionKey.ACTION][0].cpu().numpy() for end in ends]
         if bounds is None:
             return np.ones(self.policy.action_dims, dtype=bool)
         near = 0.01 * (bounds["max"] - bounds["min"])
@@ -71,6 +121,11 @@ class Recorder:
     pixels: list[list[NDArray[Any]]] = field(default_factory=list)
     action: list[NDArray[Any]] = field(default_factory=list)
     reward: list[float] = field(default_factory=list)
+    taught: list[bool] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        """Steps so far."""
+        return len(self.action)
 
     def observe(self, prepared: Frame) -> None:
         """Keep a prepared frame."""
@@ -79,10 +134,20 @@ class Recorder:
             self.low_dim.append(low_dim)
         self.pixels.append(self.agent.pixels(prepared))
 
-    def step(self, action: torch.Tensor, reward: float) -> None:
-        """Keep what was done [1, D] and what it earned."""
+    def retake(self, prepared: Frame, reward: float) -> None:
+        """Keep a frame in place of the last one, and a reward for the step that led to it."""
+        if self.low_dim:
+            self.low_dim.pop()
+        self.pixels.pop()
+        self.observe(prepared)
+        if self.reward:
+            self.reward[-1] += reward
+
+    def step(self, action: torch.Tensor, reward: float, *, taught: bool = False) -> None:
+        """Keep what was done [1, D], what it earned, and whether a person did it."""
         self.action.append(action[0].cpu().numpy())
         self.reward.append(reward)
+        self.taught.append(taught)
 
     def episode(self, *, terminated: bool, success: bool) -> Episode:
         """The finished episode."""
@@ -93,7 +158,14 @@ class Recorder:
             np.asarray(self.reward, dtype=np.float32),
             terminated,
             success,
+            _spans(self.taught),
         )
+
+
+def _spans(flags: list[bool]) -> tuple[tuple[int, int], ...]:
+    """Runs of True as (first, one past the last)."""
+    edges = np.flatnonzero(np.diff([0, *map(int, flags), 0])).tolist()
+    return tuple(zip(edges[::2], edges[1::2], strict=True))
 
 
 def _to_uint8(pixels: torch.Tensor) -> NDArray[Any]:

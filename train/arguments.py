@@ -16,11 +16,15 @@ from huggingface_hub.errors import HfHubHTTPError, HFValidationError
 from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
+from lerobot.robots.config import RobotConfig
+from lerobot.teleoperators.config import TeleoperatorConfig
 
 from lerobot_cqn.errors import ConfigError, CQNError, one_of
 
 from .checkpoint import last_checkpoint
-from .config import DatasetSettings, EvalSettings, RunConfig, WandBSettings
+from .config import DatasetSettings, EvalSettings, PageSettings, ReplaySettings, RunConfig, WandBSettings
+from .devices import register_devices
+from .robot.settings import ArmSettings
 
 __all__ = ["introduction", "parse"]
 
@@ -39,6 +43,9 @@ Train a Coarse-to-fine Q-Network from demonstrations, then online.
   imitation only (the paper's CBC):          cqn-train --policy.rl_loss_scale=0 --steps=0 --offline_updates=5000 ...
   the paper's actor-critic baseline:         cqn-train --policy.type=drqv2 --policy.preset=drqv2_plus ...
   without demonstrations:                    cqn-train --policy.preset=paper_dmc_state --env.type=dmc ...
+  on an arm, with a person at a web page:    cqn-train --robot.type=so101_follower --robot.port=... \\
+                                               --teleop.type=so101_leader --teleop.port=... --dataset.repo_id=... \\
+                                               --policy.preset=paper_real_world --online_minutes=10 ...
   evaluate with LeRobot:                     lerobot-eval --policy.path=.../pretrained_model --env.type=ur5e_station
 
 Presets (--policy.preset=NAME; every number can be replaced, docs/algorithm.md and docs/baselines.md have them):
@@ -61,7 +68,10 @@ PRESETS: dict[str, dict[str, str]] = {
         "laptop_pixels": "ours: DrQ-v2+ at the sizes of CQN's laptop_pixels",
     },
 }
-LAST = "Add --env.type=... or --policy.type=cqn before --help to see their options; --debug shows tracebacks.\n"
+LAST = (
+    "Add --env.type=..., --robot.type=... or --policy.type=cqn before --help to see their options; --debug shows "
+    "tracebacks.\n"
+)
 
 
 def introduction() -> str:
@@ -76,7 +86,9 @@ def introduction() -> str:
 
 def parse(arguments: Sequence[str]) -> RunConfig:
     """Run settings from the command line. Raises ConfigError for anything that does not parse."""
-    arguments = _with_plugins(arguments)
+    arguments = ["--operator_page=true" if a == "--operator_page" else a for a in _with_plugins(arguments)]
+    if any(a.startswith(("--robot.", "--teleop.", "--resume")) for a in arguments):
+        register_devices()
     config_file: str | None = None
     if _flag(arguments, "resume"):
         output_dir = parser.parse_arg("output_dir", arguments)
@@ -90,7 +102,7 @@ def parse(arguments: Sequence[str]) -> RunConfig:
     if path is not None:
         arguments = [a for a in arguments if not a.startswith("--policy.")]
         overrides = [a for a in overrides if not a.startswith("--path")]
-    for kind in ("policy", "env"):
+    for kind in ("policy", "env", "robot", "teleop"):
         settings = [a for a in arguments if a.startswith(f"--{kind}.")]
         if settings and config_file is None and parser.parse_arg(f"{kind}.type", arguments) is None:
             raise ConfigError(f"{settings[0]} needs to know of which {kind}: give --{kind}.type=... as well.")
@@ -181,14 +193,15 @@ def _option_error(complaint: str, arguments: Sequence[str]) -> str:
 def _options(arguments: Sequence[str]) -> list[str]:
     """Every option there is for the chosen environment."""
     groups: dict[str, type] = {
-        "": RunConfig, "dataset.": DatasetSettings, "eval.": EvalSettings,
-        "wandb.": WandBSettings,
+        "": RunConfig, "dataset.": DatasetSettings, "eval.": EvalSettings, "wandb.": WandBSettings,
+        "replay.": ReplaySettings, "arm.": ArmSettings, "page.": PageSettings,
     }  # fmt: skip
     policy = parser.parse_arg("policy.type", list(arguments)) or "cqn"
     if policy in PreTrainedConfig.get_known_choices():
         groups["policy."] = PreTrainedConfig.get_choice_class(policy)
-    env = parser.parse_arg("env.type", list(arguments))
-    if env in EnvConfig.get_known_choices():
-        groups["env."] = EnvConfig.get_choice_class(env)
+    for kind, choices in (("env", EnvConfig), ("robot", RobotConfig), ("teleop", TeleoperatorConfig)):
+        chosen = parser.parse_arg(f"{kind}.type", list(arguments))
+        if chosen in choices.get_known_choices():
+            groups[f"{kind}."] = choices.get_choice_class(chosen)
     names = [f"--{group}{field.name}" for group, config in groups.items() for field in fields(config)]
-    return [*names, "--policy.type", "--policy.path", "--env.type"]
+    return [*names, "--policy.type", "--policy.path", "--env.type", "--robot.type", "--teleop.type"]

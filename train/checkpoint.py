@@ -34,6 +34,7 @@ class Counters:
     updates: int = 0
     offline_done: bool = False
     wall_s: float = 0.0
+    online_s: float = 0.0  # acting and learning online, without waiting for a person
 
 
 def last_checkpoint(output_dir: Path) -> Path:

@@ -28,30 +28,36 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_cqn.base_config import RLConfig
 from lerobot_cqn.base_policy import RLPolicy
 from lerobot_cqn.errors import ConfigError, CQNError, OutputExistsError
+from lerobot_cqn.joint_goals import converted_deltas
 from lerobot_cqn.learner import Learner
 
 from . import envs  # noqa: F401  # registers our environments
 from .agent import Agent
 from .arguments import introduction, parse
+from .arm_parts import Operated, make_operated, steering
 from .checkpoint import Counters, last_checkpoint, restore, save, seed_everything
 from .config import RunConfig
-from .console import ConsoleMonitor
+from .console import ConsoleMonitor, Monitors
 from .demonstrations import load_episodes, load_metadata
 from .gym_env import GymEnvironment, GymScenes, OneScene
-from .interfaces import Scenes
+from .interfaces import Environment, Interrupted, Scenes
 from .look import draw_batch, warnings_about
 from .metrics import Log, Metrics, start_tensorboard, start_wandb
-from .online import Interrupted, Trainer
+from .online import Monitor, Nobody, Trainer
 from .replay import Episode, Replay
 
 __all__ = ["main"]
 
 
-def build(config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], bool]) -> Trainer:
-    """Check everything, then make every part of a run. Raises CQNError before any work is done."""
+def build(
+    config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], bool], stack: contextlib.ExitStack
+) -> Trainer:
+    """Check everything, then make every part of a run. Raises CQNError before any work is done.
+
+    stack: takes up what must be closed again.
+    """
     config.validate()
-    assert isinstance(config.policy, RLConfig)  # noqa: S101  # validate has checked these three
-    assert config.env is not None and config.output_dir is not None  # noqa: S101, PT018
+    assert isinstance(config.policy, RLConfig) and config.output_dir is not None  # noqa: S101, PT018  # just validated
     checkpoint = last_checkpoint(config.output_dir) if config.resume else None
     if not config.resume and config.output_dir.exists() and any(config.output_dir.iterdir()):
         raise OutputExistsError(
@@ -60,13 +66,13 @@ def build(config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], 
     if config.threads:
         torch.set_num_threads(config.threads)
     rng = seed_everything(config.seed)
-    env = GymEnvironment(config.env, config.policy)
-    agent = make_agent(config, checkpoint, env)
-    check_fits(config.env, agent.policy, "policy" if config.continues else "dataset")
+    gym = GymEnvironment(config.env, config.policy) if config.env is not None else None
+    agent = make_agent(config, checkpoint, gym)
+    operated = make_operated(config, agent, should_stop, monitor.message) if gym is None else None
+    env, scenes = make_scenes(config, agent, gym, operated)
+    stack.callback(env.close)
+    stack.callback(scenes.close)
     s = config.policy.settings
-    scenes: Scenes = OneScene(env)
-    if config.eval.batch_size > 1:
-        scenes = GymScenes(config.env, config.policy, config.eval.batch_size, apart=config.eval.use_async_envs)
     replay = Replay(
         s.frame_stack, s.n_step, s.discount, folder=config.output_dir / "replay",
         capacity_gib=config.replay.capacity_gib, by_step=config.replay.sampling == "steps",
@@ -78,22 +84,17 @@ def build(config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], 
             for episode in load_episodes(config.dataset, agent, lambda i, n: monitor.advance(i, f"episode {i}/{n}")):
                 replay.add_demonstration(episode)
                 demonstrations.append(replace(episode, pixels=()))
-        for sentence in warnings_about(demonstrations, free=agent.inside(env.action_bounds())):
+        bounds = gym.action_bounds() if gym is not None else None
+        for sentence in warnings_about(demonstrations, free=agent.inside(bounds)):
             monitor.message(f"Warning: {sentence}")
         finished = replay.reopen() if checkpoint is not None else []
     config.output_dir.mkdir(parents=True, exist_ok=True)
-    run_config = draccus.encode(config)
     if checkpoint is None and replay.episodes:
         picture = config.output_dir / "first_batch.png"
         sizes = (256, 256 if replay.demonstrations else 0)  # enough to have a reward among them
         draw_batch(replay.sample(*sizes, np.random.default_rng(config.seed)), picture)
         monitor.message(f"First batch: {picture}")
-    also: list[Log] = []
-    if config.tensorboard:
-        also.append(start_tensorboard(config.output_dir / "tensorboard"))
-    if config.wandb.enable:
-        also.append(start_wandb(config.wandb.project, config.output_dir.name, run_config, config.wandb.mode))
-    metrics = Metrics(config.output_dir, also)
+    metrics = Metrics(config.output_dir, also_to(config, operated))
     learner, counters = Learner(agent.policy.model), Counters()
     if checkpoint is not None:
         counters, tables = restore(checkpoint, learner, rng)
@@ -104,13 +105,44 @@ def build(config: RunConfig, monitor: ConsoleMonitor, should_stop: Callable[[], 
     def save_checkpoint() -> None:
         assert config.output_dir is not None  # noqa: S101
         save(
-            config.output_dir, agent, learner, rng, counters, tables=metrics.sizes(), run_config=run_config,
+            config.output_dir, agent, learner, rng, counters, tables=metrics.sizes(), run_config=draccus.encode(config),
         )  # fmt: skip
 
+    shown: Monitor = monitor
+    if operated is not None:
+        stack.callback(lambda: monitor.message(operated.env.summary()) if operated.env.summary() else None)
+        stack.enter_context(steering(config, operated, monitor.message))
+        shown = Monitors([monitor, operated.board])
     return Trainer(
-        config, agent, learner, env, scenes, replay, metrics, monitor, rng, counters, save_checkpoint, should_stop,
-        finished_since=finished,
+        config, agent, learner, env, scenes, replay, metrics, shown, rng, counters, save_checkpoint, should_stop,
+        finished_since=finished, person=Nobody() if operated is None else operated.session,
     )  # fmt: skip
+
+
+def also_to(config: RunConfig, operated: Operated | None) -> list[Log]:
+    """Where metrics go besides their files."""
+    assert config.output_dir is not None  # noqa: S101  # validate has checked it
+    also: list[Log] = [] if operated is None else [operated.board.log]
+    if config.tensorboard:
+        also.append(start_tensorboard(config.output_dir / "tensorboard"))
+    if config.wandb.enable:
+        run_config = draccus.encode(config)
+        also.append(start_wandb(config.wandb.project, config.output_dir.name, run_config, config.wandb.mode))
+    return also
+
+
+def make_scenes(
+    config: RunConfig, agent: Agent, gym: GymEnvironment | None, operated: Operated | None
+) -> tuple[Environment, Scenes]:
+    """What is acted in to learn, and to evaluate; an arm is both."""
+    assert isinstance(config.policy, RLConfig)  # noqa: S101  # validate has checked it
+    if gym is None or config.env is None:
+        assert operated is not None  # noqa: S101  # an environment or an arm
+        return operated.env, OneScene(operated.env)
+    check_fits(config.env, agent.policy, "policy" if config.continues else "dataset")
+    if config.eval.batch_size == 1:
+        return gym, OneScene(gym)
+    return gym, GymScenes(config.env, config.policy, config.eval.batch_size, apart=config.eval.use_async_envs)
 
 
 @contextlib.contextmanager
@@ -126,12 +158,12 @@ def _nothing_left(folder: Path | None) -> Iterator[None]:
         raise
 
 
-def make_agent(config: RunConfig, checkpoint: Path | None, env: GymEnvironment) -> Agent:
+def make_agent(config: RunConfig, checkpoint: Path | None, env: GymEnvironment | None) -> Agent:
     """Policy and processors: new ones from the dataset's statistics, or those of a checkpoint.
 
     Without a dataset the features are the environment's and the state stays as it is.
     """
-    assert isinstance(config.policy, RLConfig) and config.env is not None  # noqa: S101, PT018
+    assert isinstance(config.policy, RLConfig)  # noqa: S101  # validate has checked it
     pretrained = checkpoint / "pretrained_model" if checkpoint is not None else config.policy.pretrained_path
     policy: Any
     if pretrained is not None:
@@ -145,18 +177,27 @@ def make_agent(config: RunConfig, checkpoint: Path | None, env: GymEnvironment) 
         pre, post = make_pre_post_processors(config.policy, pretrained_path=str(pretrained))
     else:
         stats: dict[str, dict[str, Any]] = {}
+        meta = None
         if config.dataset.repo_id:
             meta = load_metadata(config.dataset)
             policy = make_policy(config.policy, ds_meta=meta)
-            stats = dict(meta.stats)
+            stats = dict(meta.stats or {})
+        elif config.env is None:
+            raise ConfigError(
+                "An arm needs demonstrations, or a policy that was trained on some: give --dataset.repo_id."
+            )
         else:
             policy = make_policy(config.policy, env_cfg=config.env)
         if config.recipe.action_bounds == "environment":
-            bounds = env.action_bounds()
+            bounds = env.action_bounds() if env is not None else None
+            if meta is not None and converted_deltas(meta) is not None:
+                raise ConfigError(
+                    "The dataset's actions are differences, the environment bounds goals: give --action_bounds=data."
+                )
             if bounds is None:
                 raise ConfigError("The environment bounds no action: give --action_bounds=data and a dataset.")
             stats[ACTION] = bounds
-        pre, post = make_pre_post_processors(config.policy, dataset_stats=stats)
+        pre, post = make_pre_post_processors(config.policy, dataset_stats=stats, dataset_meta=meta)
     policy.train()
     return Agent(policy, pre, post)
 
@@ -251,21 +292,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(config: RunConfig) -> int:
     """Build and train; 0 when complete, 130 when stopped on request with a checkpoint saved."""
-    trainer: Trainer | None = None
-    try:
-        with ConsoleMonitor() as monitor, StopRequest() as should_stop:
-            trainer = build(config, monitor, should_stop)
-            try:
-                trainer.run()
-            except Interrupted:
-                trainer.save()
-                monitor.message(f"Stopped. Continue with: cqn-train --resume=true --output_dir={config.output_dir}")
-                return 130
-            monitor.message(f"Policy: {config.output_dir}/checkpoints/last/pretrained_model")
-        return 0
-    finally:
-        if trainer is not None:
-            trainer.close()
+    with ConsoleMonitor() as monitor, StopRequest() as should_stop, contextlib.ExitStack() as stack:
+        trainer = build(config, monitor, should_stop, stack)
+        try:
+            trainer.run()
+        except Interrupted:
+            trainer.save()
+            monitor.message(f"Stopped. Continue with: cqn-train --resume=true --output_dir={config.output_dir}")
+            return 130
+        monitor.message(f"Policy: {config.output_dir}/checkpoints/last/pretrained_model")
+    return 0
 
 
 def set_up_logging(debug: bool) -> None:

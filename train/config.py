@@ -6,11 +6,15 @@ from pathlib import Path
 
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
+from lerobot.robots.config import RobotConfig
+from lerobot.teleoperators.config import TeleoperatorConfig
 
 from lerobot_cqn.base_config import RLConfig
 from lerobot_cqn.errors import ConfigError, one_of
 
-__all__ = ["DatasetSettings", "EvalSettings", "Recipe", "ReplaySettings", "RunConfig", "WandBSettings"]
+from .robot.settings import ArmSettings
+
+__all__ = ["DatasetSettings", "EvalSettings", "PageSettings", "Recipe", "ReplaySettings", "RunConfig", "WandBSettings"]
 
 
 @dataclass(frozen=True)
@@ -38,8 +42,8 @@ _RECIPES: dict[str, Recipe] = {
 
 _LEAST: dict[str, int] = {
     "steps": 0, "offline_updates": 0, "save_freq": 1, "log_freq": 1, "threads": 0, "seed": 0, "updates_per_step": 0,
-    "updates_per_episode": 0, "batch_size": 0, "demo_batch_size": 0, "eval.n_episodes": 1, "eval.final_n_episodes": 1,
-    "eval.batch_size": 1, "eval.videos": 0,
+    "updates_per_episode": 0, "batch_size": 0, "demo_batch_size": 0, "eval.n_episodes": 1,
+    "eval.batch_size": 1, "eval.videos": 0, "async_updates": 0,
 }  # fmt: skip
 
 
@@ -54,11 +58,11 @@ class DatasetSettings:
 
 @dataclass
 class EvalSettings:
-    """Evaluation episodes: deterministic policy, fixed seeds."""
+    """Evaluation episodes: deterministic policy, fixed seeds. On a real arm there are none unless asked for."""
 
-    freq: int = 1000  # environment steps between evaluations; 0: only after the offline phase and at the end
+    freq: int | None = None  # environment steps between evaluations, 0: none on the way; None: 1000, on an arm 0
     n_episodes: int = 20  # of each evaluation on the way
-    final_n_episodes: int = 50  # after the offline phase and at the end
+    final_n_episodes: int | None = None  # after the offline phase and at the end; None: 50, on an arm 0
     batch_size: int = 1  # episodes at a time, for one batch of actions
     use_async_envs: bool = False  # each in a process of its own: worth it with cameras and several cores
     videos: int = 0  # films of the first episodes of each evaluation, in output_dir/videos
@@ -70,6 +74,15 @@ class ReplaySettings:
 
     capacity_gib: float = 16.0  # of the demonstrations and the run's episodes together; the oldest make room
     sampling: str = "episodes"  # uniform over episodes, then over their steps (the reference's); or over "steps"
+
+
+@dataclass
+class PageSettings:
+    """The operator's page of a run on an arm. Its token is new in every run, or that of CQN_PAGE_TOKEN."""
+
+    host: str = "127.0.0.1"  # another one lets other machines reach the page: whoever has the token moves the arm
+    port: int = 8765  # 0: any free one
+    absent_s: float = 10.0  # seconds without a sign of the operator's page after which the arm is paused
 
 
 @dataclass
@@ -85,20 +98,28 @@ class WandBSettings:
 class RunConfig:
     """Train a policy: `offline_updates` on the demonstrations, then `steps` control steps online.
 
+    In a simulated environment (`--env.type`), or on an arm (`--robot.type`) with a person who says how episodes went.
     Update schedule, batch sizes, relabelling and action bounds left at None follow the policy's preset
-    (docs/algorithm.md).
+    (docs/algorithm.md); on an arm updates are made between episodes.
     """
 
     policy: PreTrainedConfig | None = None
     env: EnvConfig | None = None
+    robot: RobotConfig | None = None  # an arm instead of an environment
+    teleop: TeleoperatorConfig | None = None  # leader arm with the robot's joints, to take over with
+    arm: ArmSettings = field(default_factory=ArmSettings)
+    operator_page: bool = True  # steer a run on an arm from a web page; false: by keys in the terminal
+    page: PageSettings = field(default_factory=PageSettings)
     dataset: DatasetSettings = field(default_factory=DatasetSettings)
     output_dir: Path | None = None  # a new or empty folder for checkpoints and metrics
     resume: bool = False  # continue the run in output_dir from its last checkpoint
     seed: int = 1000  # of weights, batches, exploration and training scenes
     steps: int = 30_000  # control steps online, then the episode is finished; 0 trains offline only
+    online_minutes: float | None = None  # of acting and learning, waits for a person not counted; None: `steps` alone
     offline_updates: int = 0  # updates on the demonstrations before the first step
     updates_per_step: int | None = None  # after each control step; None: the preset's
     updates_per_episode: int | None = None  # between episodes; None: the preset's
+    async_updates: int = 0  # at most so many beside an episode; it acts with the policy it began with
     batch_size: int | None = None  # from everything seen; None: the preset's
     demo_batch_size: int | None = None  # from demonstrations and successes, on top; None: the preset's
     relabel: bool | None = None  # successful online episodes become demonstrations; None: the preset's
@@ -121,10 +142,12 @@ class RunConfig:
             )
         if self.output_dir is None:
             raise ConfigError("No output directory: give --output_dir=DIR.")
-        if self.env is None:
+        if (self.env is None) == (self.robot is None):
             raise ConfigError(
-                "No environment: give --env.type=..., for example --env.type=ur5e_station (lerobot-train needs none)."
+                "Expected either an environment or an arm: give --env.type=..., for example --env.type=ur5e_station, "
+                "or --robot.type=... (lerobot-train needs none)."
             )
+        self._validate_arm()
         recipe = self.recipe
         learns_from_data = recipe.demo_batch_size > 0 or self.offline_updates > 0
         if not self.dataset.repo_id and (learns_from_data or (recipe.action_bounds == "data" and not self.continues)):
@@ -136,12 +159,47 @@ class RunConfig:
             value = attrgetter(name)(recipe if hasattr(recipe, name) else self)
             if value < least:
                 raise ConfigError(f"`{name}` must be at least {least}, got {value}.")
+        for name, value in (("eval.freq", self.eval_freq), ("eval.final_n_episodes", self.final_episodes)):
+            if value < 0:
+                raise ConfigError(f"`{name}` must be at least 0, got {value}.")
         if not 0 < self.replay.capacity_gib < float("inf"):
             raise ConfigError(f"`replay.capacity_gib` must be positive and finite, got {self.replay.capacity_gib}.")
         if self.replay.sampling not in (valid := ("episodes", "steps")):
             raise ConfigError(one_of("replay.sampling", self.replay.sampling, valid))
         if recipe.action_bounds not in (valid := ("data", "environment")):
             raise ConfigError(one_of("action_bounds", recipe.action_bounds, valid))
+
+    def _validate_arm(self) -> None:
+        if self.online_minutes is not None and not self.online_minutes > 0:
+            raise ConfigError(f"`online_minutes` must be positive, got {self.online_minutes}.")
+        if self.robot is None:
+            if self.teleop is not None:
+                raise ConfigError("--teleop.type is the leader of an arm: give --robot.type as well, or leave it out.")
+            return
+        self.arm.validate()
+        if self.eval.batch_size > 1 or self.eval.use_async_envs:
+            raise ConfigError("There is one arm: leave out --eval.batch_size and --eval.use_async_envs.")
+        if self.recipe.updates_per_step:
+            raise ConfigError(
+                "Updates after each step would make the arm jerk: leave out --updates_per_step, or give "
+                "--updates_per_episode, or --async_updates."
+            )
+        if not 0 <= self.page.port <= 65535:
+            raise ConfigError(f"`page.port` must be 0 to 65535, got {self.page.port}.")
+        if not 1 <= self.page.absent_s <= 3600:
+            raise ConfigError(f"`page.absent_s` must be 1 to 3600 seconds, got {self.page.absent_s}.")
+
+    @property
+    def eval_freq(self) -> int:
+        """Environment steps between evaluations, 0 for none."""
+        freq = self.eval.freq
+        return freq if freq is not None else 0 if self.robot is not None else 1000
+
+    @property
+    def final_episodes(self) -> int:
+        """Evaluation episodes after the offline phase and at the end."""
+        count = self.eval.final_n_episodes
+        return count if count is not None else 0 if self.robot is not None else 50
 
     @property
     def continues(self) -> bool:
@@ -153,4 +211,7 @@ class RunConfig:
         """The preset's, with what was given on top."""
         preset = self.policy.preset if isinstance(self.policy, RLConfig) else ""
         given = {field.name: getattr(self, field.name) for field in fields(Recipe)}
-        return replace(_RECIPES.get(preset, Recipe()), **{k: v for k, v in given.items() if v is not None})
+        recipe = _RECIPES.get(preset, Recipe())
+        if self.robot is not None:  # the paper's on a real arm: no update while it moves
+            recipe = replace(recipe, updates_per_step=0, updates_per_episode=recipe.updates_per_episode or 50)
+        return replace(recipe, **{k: v for k, v in given.items() if v is not None})

@@ -1,8 +1,9 @@
 """Progress for a person: a live bar on a terminal, a line now and then in a log."""
 
 import time
+from collections.abc import Sequence
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from rich.console import Console
 from rich.progress import (
@@ -15,7 +16,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-__all__ = ["ConsoleMonitor"]
+__all__ = ["ConsoleMonitor", "Monitors"]
 
 LOG_EVERY_S = 15.0
 
@@ -74,3 +75,25 @@ class ConsoleMonitor:
     def message(self, text: str) -> None:
         """A line that stays."""
         self.console.print(text)
+
+
+class Monitors:
+    """Several places that show the same progress."""
+
+    def __init__(self, monitors: Sequence[Any]) -> None:
+        self.monitors = monitors
+
+    def phase(self, name: str, total: int, done: int) -> None:
+        """As `ConsoleMonitor.phase`, everywhere."""
+        for monitor in self.monitors:
+            monitor.phase(name, total, done)
+
+    def advance(self, done: int, note: str) -> None:
+        """As `ConsoleMonitor.advance`, everywhere."""
+        for monitor in self.monitors:
+            monitor.advance(done, note)
+
+    def message(self, text: str) -> None:
+        """As `ConsoleMonitor.message`, everywhere."""
+        for monitor in self.monitors:
+            monitor.message(text)

@@ -4,14 +4,10 @@ Runs the same commands a user would type, two trainings at a time on one thread 
 Interrupted at any moment, it continues where it was when started again.
 """
 
-import csv
 import json
-import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +18,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 
 from lerobot_cqn.errors import CQNError
+
+from .stages import Stages, fresh, read_rows
 
 __all__ = ["DemoConfig", "main", "run_demo"]
 
@@ -46,83 +44,18 @@ class DemoConfig:
     expert_episodes: int = 50
 
 
-class DemoError(CQNError):
-    """A command of the demo failed; the message names its log."""
-
-
-class Stages:
-    """Runs commands with their output in a log, one line on the terminal each, skipping what is done."""
-
-    def __init__(self, config: DemoConfig, console: Console) -> None:
-        self.config, self.console = config, console
-        self.logs = config.output_dir / "logs"
-        self.logs.mkdir(parents=True, exist_ok=True)
-        self.environment = os.environ | {
-            "HF_HUB_OFFLINE": "1",
-            "OMP_NUM_THREADS": "1",
-            "TOKENIZERS_PARALLELISM": "false",
-        }
-
-    @contextmanager
-    def timed(self) -> Iterator[None]:
-        """Note how long this start worked; `seconds` adds up all starts."""
-        begun = time.monotonic()
-        try:
-            yield
-        finally:
-            with (self.logs / "seconds.txt").open("a") as file:
-                file.write(f"{time.monotonic() - begun:.1f}\n")
-
-    def seconds(self) -> float:
-        """Working time of this and of interrupted starts."""
-        return sum(float(line) for line in (self.logs / "seconds.txt").read_text().split())
-
-    def start(self, name: str, module: str, *arguments: str) -> subprocess.Popen[bytes]:
-        """Start `python -m module arguments` with its output in logs/name.log."""
-        with (self.logs / f"{name}.log").open("ab") as log:
-            return subprocess.Popen(
-                [sys.executable, "-m", module, *arguments], stdout=log, stderr=subprocess.STDOUT, env=self.environment
-            )
-
-    def check(self, name: str, code: int) -> None:
-        """Raise DemoError with the last line of the log when a command failed."""
-        if code:
-            log = self.logs / f"{name}.log"
-            lines = log.read_text(errors="replace").strip().splitlines() or ["no output"]
-            raise DemoError(f"'{name}' failed with exit code {code}: {lines[-1]} (all of it in {log})")
-
-    def run(self, name: str, text: str, target: Path, module: str, *arguments: str) -> None:
-        """Run a command that makes the folder `target`, unless an earlier start has finished it."""
-        begun, finished = time.monotonic(), self.logs / f"{name}.done"
-        if finished.exists():
-            self.console.print(f"  {text:<58} already done")
-            return
-        _fresh(target)
-        with self.console.status(f"  {text}"):
-            process = self.start(name, module, *arguments)
-            try:
-                code = process.wait()
-            except KeyboardInterrupt:  # it has received the signal too, and is tidying up
-                process.wait()
-                raise
-            self.check(name, code)
-        finished.touch()
-        self.console.print(f"  {text:<58} {time.monotonic() - begun:5.0f} s")
-
-
 def run_demo(config: DemoConfig, console: Console) -> dict[str, Any]:
     """Everything, in order; returns what `summary.json` holds. Raises DemoError when a command fails."""
     from .report import write_report
 
-    stages = Stages(config, console)
+    stages = Stages(config.output_dir, console)
     with stages.timed():
-        _prepare_and_train(stages)
+        _prepare_and_train(stages, config)
     with console.status("  drawing the report"):
         return write_report(config, VARIANTS, stages.seconds())
 
 
-def _prepare_and_train(stages: Stages) -> None:
-    config = stages.config
+def _prepare_and_train(stages: Stages, config: DemoConfig) -> None:
     data = {name: config.output_dir / "data" / name for name in VARIANTS}
     report = config.output_dir / "dropped.json"
     stages.run(
@@ -136,12 +69,11 @@ def _prepare_and_train(stages: Stages) -> None:
         "--repo_id=demo/unfiltered", f"--root={data['unfiltered']}", "--new_repo_id=demo/filtered",
         f"--new_root={data['filtered']}", f"--report={report}",
     )  # fmt: skip
-    train(stages, data)
+    train(stages, config, data)
 
 
-def train(stages: Stages, data: dict[str, Path]) -> None:
+def train(stages: Stages, config: DemoConfig, data: dict[str, Path]) -> None:
     """Train both variants side by side, with one progress bar each."""
-    config = stages.config
     running: dict[str, subprocess.Popen[bytes]] = {}
     for name in VARIANTS:
         run = config.output_dir / name
@@ -152,7 +84,7 @@ def train(stages: Stages, data: dict[str, Path]) -> None:
         else:
             arguments = [
                 "--policy.type=cqn", "--policy.preset=laptop_state", "--policy.device=cpu", *ENV,
-                f"--dataset.repo_id=demo/{name}", f"--dataset.root={data[name]}", f"--output_dir={_fresh(run)}",
+                f"--dataset.repo_id=demo/{name}", f"--dataset.root={data[name]}", f"--output_dir={fresh(run)}",
                 f"--seed={config.seed}", f"--offline_updates={config.offline_updates}", f"--steps={config.steps}",
                 f"--eval.freq={config.eval_freq}", f"--eval.n_episodes={config.eval_episodes}",
                 f"--eval.final_n_episodes={config.final_episodes}", "--save_freq=1000", "--threads=1",
@@ -188,13 +120,6 @@ def _finished(run: Path) -> bool:
     return any(row["phase"] == "final" for row in read_rows(run / "evaluations.csv"))
 
 
-def _fresh(run: Path) -> Path:
-    """Move what a cut-off start has left out of the way."""
-    if run.exists():
-        run.rename(run.with_name(f"{run.name}-unfinished-{int(time.time())}"))
-    return run
-
-
 def _progress(run: Path, config: DemoConfig) -> tuple[int, str]:
     updates, evaluations = read_rows(run / "updates.csv"), read_rows(run / "evaluations.csv")
     if not updates:
@@ -202,14 +127,6 @@ def _progress(run: Path, config: DemoConfig) -> tuple[int, str]:
     offline = min(int(updates[-1]["updates"]), config.offline_updates)
     note = f"success {float(evaluations[-1]['success_rate']):.2f}" if evaluations else "offline"
     return offline + int(updates[-1]["env_steps"]), note
-
-
-def read_rows(path: Path) -> list[dict[str, str]]:
-    """Rows of a CSV table; none while it does not exist."""
-    if not path.exists():
-        return []
-    with path.open() as file:
-        return list(csv.DictReader(file))
 
 
 def show(summary: dict[str, Any], config: DemoConfig, console: Console) -> None:

@@ -105,7 +105,7 @@ def _wave(
     agent: Agent, scenes: Scenes, seed: int, film: int
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], list[list[NDArray[Any]]]]:
     """One episode in each scene: success, length and return [K], and pictures of the first `film`."""
-    agent.policy.reset()
+    agent.reset()
     frame = scenes.reset([seed + k for k in range(scenes.count)])
     running, success = np.ones(scenes.count, dtype=bool), np.zeros(scenes.count, dtype=bool)
     length, total = np.zeros(scenes.count, dtype=int), np.zeros(scenes.count)
@@ -117,17 +117,17 @@ def _wave(
             if running[k]:
                 shown.append(pictures[k])
 
-    for _ in range(scenes.max_steps):
+    while running.any() and length.max() < scenes.max_steps:
         look()
         action, _ = agent.act(agent.prepare(frame), explore=False)
         outcome = scenes.step(agent.postprocessor(action))
         frame = outcome.frame
-        length += running
+        if outcome.skipped:
+            agent.retake(first=not length.any())
+        length += running & (not outcome.skipped)
         total += np.where(running, outcome.reward, 0.0)
         success |= running & outcome.success
         running &= ~outcome.ended
-        if not running.any():
-            break
     # The last picture of an episode that ends together with the others; one that ended before has begun anew.
     if scenes.count == 1 and films:
         films[0].append(scenes.render()[0])

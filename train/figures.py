@@ -10,7 +10,7 @@ from PIL import Image
 
 from lerobot_cqn.errors import ConfigError
 
-__all__ = ["animation", "curves", "dropped_steps", "film_strip", "poster"]
+__all__ = ["animation", "arm_session", "curves", "dropped_steps", "film_strip", "poster"]
 
 COLOURS = {"filtered": "#1f77b4", "unfiltered": "#d95f02"}
 KEPT, DROPPED = "#1f77b4", "#d9d9d9"
@@ -49,6 +49,30 @@ def curves(evaluations: Mapping[str, Rows], labels: Mapping[str, str], expert: f
     axes.axhline(expert, color="0.5", linestyle=":", linewidth=1, label="scripted expert")
     axes.set(xlabel="environment steps (0 is after offline training)", ylabel="success rate", ylim=(-0.03, 1.04))
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(evaluations) + 1, frameon=False)
+    return _png(figure)
+
+
+def arm_session(episodes: Rows, evaluations: Rows) -> bytes:
+    """A session on an arm: every episode, the running mean of 5 (the paper's measure), evaluations before and after."""
+    figure, axes = _pyplot().subplots(figsize=(7.2, 3.2))
+    success = np.array([float(row["success"]) for row in episodes])
+    taught = np.array([int(row["taught"]) > 0 for row in episodes])
+    number = np.arange(1, len(success) + 1)
+    mean = [success[max(0, i - 5) : i].mean() for i in number]
+    axes.plot(number, mean, color=COLOURS["filtered"], label="running mean of 5 episodes")
+    for chosen, colour, text in (
+        (~taught, "0.55", "episode"),
+        (taught, COLOURS["unfiltered"], "with the leader's help"),
+    ):
+        axes.scatter(number[chosen], success[chosen], s=14, color=colour, label=text, zorder=3)
+    ends = {"offline": 0, "final": len(success) + 1}
+    rows = [row for row in evaluations if row["phase"] in ends]
+    place, rate = [ends[row["phase"]] for row in rows], np.array([float(row["success_rate"]) for row in rows])
+    spread = [rate - [float(r["ci_low"]) for r in rows], [float(r["ci_high"]) for r in rows] - rate]
+    text = f"evaluation, n = {rows[0]['n']}, 95 %" if rows else "evaluation"
+    axes.errorbar(place, rate, yerr=spread, fmt="D", color="black", markersize=5, capsize=3, label=text)
+    axes.set(xlabel="episodes online", ylabel="success", ylim=(-0.05, 1.07))
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False, fontsize=8)
     return _png(figure)
 
 

@@ -56,6 +56,8 @@ class _Gym:
 class GymEnvironment(_Gym):
     """One environment, stepped by itself. Raises ConfigError where it is not installed, DataError for several tasks."""
 
+    waited_s = 0.0
+
     def __init__(self, config: EnvConfig, policy_config: PreTrainedConfig) -> None:
         super().__init__(config, policy_config, 1, apart=False)
         self.env: gym.Env[Any, Any] = self.vector.envs[0]
@@ -70,6 +72,9 @@ class GymEnvironment(_Gym):
     def fps(self) -> int:
         """Control steps a second, as LeRobot's environment config says."""
         return self._fps
+
+    def open(self) -> None:
+        """It is ready."""
 
     def reset(self, seed: int) -> Frame:
         """Start an episode that `seed` determines."""
@@ -149,10 +154,11 @@ class OneScene:
     def step(self, action: torch.Tensor) -> Outcomes:
         """Apply an action [1, D]."""
         outcome = self.env.step(action)
-        ended = outcome.success or outcome.terminated or outcome.truncated
+        ended = outcome.success or outcome.ended
         return Outcomes(
-            outcome.frame, np.array([outcome.reward]), np.array([ended]), np.array([outcome.success], dtype=bool)
-        )
+            outcome.frame, np.array([outcome.reward]), np.array([ended]), np.array([outcome.success], dtype=bool),
+            outcome.skipped,
+        )  # fmt: skip
 
     def render(self) -> Sequence[NDArray[Any]]:
         """One picture."""

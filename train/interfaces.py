@@ -1,15 +1,28 @@
 """What the loop needs from the world; environments and arms meet it here, and only here."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any, Protocol
 
 import torch
 from numpy.typing import NDArray
 
-__all__ = ["Environment", "Frame", "Outcome", "Outcomes", "Scenes"]
+__all__ = ["Environment", "Frame", "Interrupted", "Label", "Outcome", "Outcomes", "Person", "Scenes"]
 
 Frame = dict[str, Any]
+
+
+class Interrupted(Exception):  # noqa: N818  # a request, not an error
+    """The person asked to stop; the trainer is in a state that can be saved."""
+
+
+class Label(StrEnum):
+    """How an episode went, in a person's judgement."""
+
+    SUCCESS = "success"
+    FAILURE = "failure"
+    DISCARD = "discard"  # neither: not to be learned from
 
 
 @dataclass(frozen=True)
@@ -18,6 +31,9 @@ class Outcome:
 
     frame: the new observation under LeRobot's names, one batch dimension of 1.
     terminated: a real end (success); truncated: out of time, the value of the last observation still counts.
+    sent: command [1, D] in the environment's units that was carried out; None: the one that was asked for.
+    taught: a person chose it. skipped: the step came to nothing (a pause, a fault): `frame` takes the place of the one
+    before, and an end is that of the step before. discarded: the episode has ended and is not to be learned from.
     """
 
     frame: Frame
@@ -25,6 +41,15 @@ class Outcome:
     terminated: bool
     truncated: bool
     success: bool
+    sent: torch.Tensor | None = None
+    taught: bool = False
+    skipped: bool = False
+    discarded: bool = False
+
+    @property
+    def ended(self) -> bool:
+        """Whether the episode is over."""
+        return self.terminated or self.truncated or self.discarded
 
 
 class Environment(Protocol):
@@ -40,8 +65,17 @@ class Environment(Protocol):
         """Control steps a second."""
         ...
 
+    @property
+    def waited_s(self) -> float:
+        """Seconds so far in which a person was waited for."""
+        ...
+
+    def open(self) -> None:
+        """Get ready; called once, before the first episode."""
+        ...
+
     def reset(self, seed: int) -> Frame:
-        """Start an episode that `seed` determines."""
+        """Start an episode that `seed` determines. Raises Interrupted when the person wants no more."""
         ...
 
     def step(self, action: torch.Tensor) -> Outcome:
@@ -57,14 +91,31 @@ class Environment(Protocol):
         ...
 
 
+class Person(Protocol):
+    """Who judges episodes and may change their mind, as the loop sees them."""
+
+    def expect(self, number: int | None) -> None:
+        """Say which episode of the run starts next; None: evaluations."""
+        ...
+
+    def learning(self, doing: str) -> None:
+        """Say what the learner is at; no episode can start until the environment is asked for one."""
+        ...
+
+    def take_relabelled(self) -> Mapping[int, Label]:
+        """Labels of finished episodes, by number, that were changed since the last call."""
+        ...
+
+
 @dataclass(frozen=True)
 class Outcomes:
-    """What one control step brought in K scenes; `frame` has K rows, the arrays are [K]."""
+    """What one control step brought in K scenes; `frame` has K rows, the arrays are [K]. skipped: as in `Outcome`."""
 
     frame: Frame
     reward: NDArray[Any]
     ended: NDArray[Any]
     success: NDArray[Any]
+    skipped: bool = False
 
 
 class Scenes(Protocol):

@@ -2,8 +2,9 @@
 
 import contextlib
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,22 +13,20 @@ from lerobot_cqn.learner import Learner, NonFiniteLossError
 from lerobot_cqn.schema import Batch
 
 from .agent import Agent, Recorder
+from .background import Background
 from .checkpoint import Counters
 from .config import RunConfig
 from .evaluate import Evaluation, evaluate
-from .interfaces import Environment, Scenes
+from .interfaces import Environment, Interrupted, Label, Outcome, Person, Scenes
 from .look import save_batch, write_films
 from .metrics import Metrics
-from .replay import Replay
+from .replay import Episode, Replay
 from .storage import Place
 
-__all__ = ["Interrupted", "Monitor", "Trainer"]
+__all__ = ["Monitor", "Nobody", "Trainer"]
 
 RECENT = 20  # training episodes in the progress line
-
-
-class Interrupted(Exception):  # noqa: N818  # a request, not an error
-    """The person asked to stop; the trainer is in a state that can be saved."""
+SET_ASIDE = 5  # discarded episodes that may still be labelled otherwise
 
 
 class Monitor(Protocol):
@@ -44,6 +43,20 @@ class Monitor(Protocol):
     def message(self, text: str) -> None:
         """A line that stays."""
         ...
+
+
+class Nobody:
+    """The person of an environment that judges for itself."""
+
+    def expect(self, number: int | None) -> None:
+        """There is nobody to tell."""
+
+    def learning(self, doing: str) -> None:
+        """There is nobody to tell."""
+
+    def take_relabelled(self) -> dict[int, Label]:
+        """Nothing."""
+        return {}
 
 
 @dataclass
@@ -64,84 +77,154 @@ class Trainer:
     should_stop: Callable[[], bool]
     evaluations: list[tuple[str, Evaluation]] = field(default_factory=list)
     finished_since: Sequence[Place] = ()
+    person: Person = field(default_factory=Nobody)
+    _aside: dict[int, tuple[Episode, dict[str, Any]]] = field(default_factory=dict)
     _recent: list[bool] = field(default_factory=list)
     _clock: float = field(default_factory=time.monotonic)
 
     def run(self) -> None:
         """Offline phase, online phase, final evaluation. Raises Interrupted between two updates or steps."""
+        self.env.open()
         self.take_up(self.finished_since)
-        if not self.counters.offline_done:
-            self._offline()
-        self._online()
-        self.evaluate("final", self.config.eval.final_n_episodes)
+        try:
+            if not self.counters.offline_done:
+                self._offline()
+            self._online()
+            self.evaluate("final", self.config.final_episodes)
+        finally:
+            self._relabel()  # what was said since the last episode, before a stop
         self.save()
-
-    def close(self) -> None:
-        """Free the simulators."""
-        self.scenes.close()
-        self.env.close()
 
     def _offline(self) -> None:
         total = self.config.offline_updates
         self.monitor.phase("offline", total, self.counters.updates)
+        self.person.learning("offline updates")
         self.updates(total - self.counters.updates, on_update=lambda: self.monitor.advance(self.counters.updates, ""))
         if total and self.config.steps:
-            self.evaluate("offline", self.config.eval.final_n_episodes)
+            self.evaluate("offline", self.config.final_episodes)
         self.counters.offline_done = True
         self.save()
 
     def _online(self) -> None:
-        c, freq = self.counters, self.config.eval.freq
+        c = self.counters
         self.monitor.phase("online", self.config.steps, c.env_steps)
-        while c.env_steps < self.config.steps:
-            before = c.env_steps
+        while c.env_steps < self.config.steps and not self._out_of_time():
+            before, number, began, waited = c.env_steps, c.episodes, time.monotonic(), self.env.waited_s
             try:
                 self.episode()
             except Interrupted:  # the unfinished episode is dropped, so its steps do not count either
-                c.env_steps = before
+                c.env_steps = before if c.episodes == number else c.env_steps
                 raise
-            self.updates(self.config.recipe.updates_per_episode)
-            if freq and c.env_steps // freq > before // freq and c.env_steps < self.config.steps:
-                self.evaluate("online", self.config.eval.n_episodes)
-            if c.env_steps // self.config.save_freq > before // self.config.save_freq:
-                self.save()
+            self._relabel()
+            self.updates(self.config.recipe.updates_per_episode, on_update=self._tell_updates)
+            c.online_s += time.monotonic() - began - (self.env.waited_s - waited)
+            self._look_and_save(before)
+
+    def _look_and_save(self, before: int) -> None:
+        """Evaluate and save where the steps since `before` say so."""
+        c, freq = self.counters, self.config.eval_freq
+        if freq and c.env_steps // freq > before // freq and c.env_steps < self.config.steps:
+            self.evaluate("online", self.config.eval.n_episodes)
+        if c.env_steps // self.config.save_freq > before // self.config.save_freq:
+            self.person.learning("saving a checkpoint")
+            self.save()
 
     def episode(self) -> None:
         """Act once from reset to end, learn while acting, and store what happened."""
         c, recorder = self.counters, Recorder(self.agent)
-        self.agent.policy.reset()
+        self.agent.reset()
+        self.person.expect(c.episodes)
         # The seed follows from the episode's number: a resumed run meets the same scenes.
         prepared = self.agent.prepare(self.env.reset(self.config.seed * 100_000 + c.episodes))
         recorder.observe(prepared)
         q_values: list[float] = []
-        for _ in range(self.env.max_steps):
-            action, q = self.agent.act(prepared, explore=True)
-            outcome = self.env.step(self.agent.postprocessor(action))
-            recorder.step(action, outcome.reward)
-            prepared = self.agent.prepare(outcome.frame)
-            recorder.observe(prepared)
-            q_values.append(q)
-            c.env_steps += 1
-            self.updates(self.config.recipe.updates_per_step)
-            if self.should_stop():
-                raise Interrupted
-            if outcome.terminated or outcome.truncated:
-                break
+        ended = False
+        try:
+            with self._background() as agent:
+                while len(recorder) < self.env.max_steps:
+                    action, q = agent.act(prepared, explore=True)
+                    outcome = self.env.step(agent.postprocessor(action))
+                    executed = agent.carried_out(action, outcome)
+                    prepared = agent.prepare(outcome.frame)
+                    if outcome.skipped:
+                        recorder.retake(prepared, outcome.reward)
+                        agent.retake(first=not len(recorder))
+                    else:
+                        recorder.step(executed, outcome.reward, taught=outcome.taught)
+                        recorder.observe(prepared)
+                        q_values.append(q)
+                        c.env_steps += 1
+                        self.updates(self.config.recipe.updates_per_step)
+                    if self.should_stop():
+                        raise Interrupted
+                    if outcome.ended:
+                        break
+                ended = True
+        finally:
+            if ended:  # also where the learner beside it failed: the person's work is not lost
+                self._store(recorder, outcome, float(np.mean(q_values)) if q_values else float("nan"))
+
+    def _store(self, recorder: Recorder, outcome: Outcome, mean_q: float) -> None:
+        """Keep a finished episode and say how it went."""
+        c, number = self.counters, self.counters.episodes
+        c.episodes += 1
+        if not len(recorder):
+            self.monitor.message(f"Episode {number} had no step.")
+            return
         episode = recorder.episode(terminated=outcome.terminated, success=outcome.success)
         demo = self.config.recipe.relabel and outcome.success
         row = {
-            "episode": c.episodes, "length": len(episode), "success": int(outcome.success),
-            "return": float(episode.reward.sum()), "mean_q": float(np.mean(q_values)),
+            "episode": number, "length": len(episode), "success": int(outcome.success),
+            "return": float(episode.reward.sum()), "mean_q": mean_q, "taught": sum(recorder.taught),
             "demonstrations": self.replay.demonstrations + demo, **self._progress(),
         }  # fmt: skip
-        self.replay.add(episode, demo=demo, number=c.episodes, note=row)
-        c.episodes += 1
+        if outcome.discarded:
+            self._aside = dict([*self._aside.items(), (number, (episode, row))][-SET_ASIDE:])
+            self.monitor.message(f"Episode {number} is discarded: nothing is learned from it.")
+            return
+        self.replay.add(episode, demo=demo, number=number, note=row)
         self.metrics.write("episodes", row)
         self._recent = [*self._recent, outcome.success][-RECENT:]
         lately = f"success {sum(self._recent)}/{len(self._recent)} lately"
-        self.monitor.advance(c.env_steps, f"episode {c.episodes}  {lately}  Q {row['mean_q']:+.2f}")
+        self.monitor.advance(c.env_steps, f"episode {c.episodes}  {lately}  Q {mean_q:+.2f}")
 
-    def updates(self, count: int, on_update: Callable[[], None] = lambda: None) -> None:
+    def _relabel(self) -> None:
+        """Learn from now on what a person says otherwise about finished episodes."""
+        for number, label in self.person.take_relabelled().items():
+            success = label is Label.SUCCESS
+            demo = self.config.recipe.relabel and success
+            if number in self._aside and label is not Label.DISCARD:
+                episode, row = self._aside.pop(number)
+                self.replay.add(replace(episode, terminated=True), demo=demo, number=number, note=row)
+                self.metrics.write("episodes", row | {"success": int(success)})
+                there = self.replay.relabel(number, success=success, demo=demo)
+            elif label is Label.DISCARD:
+                there = self.replay.forget(number)
+            else:
+                there = self.replay.relabel(number, success=success, demo=demo)
+            gone = "" if there else " It is not in the replay any more: nothing changes."
+            self.monitor.message(f"Episode {number} is a {label} now.{gone}")
+
+    def _out_of_time(self) -> bool:
+        minutes = self.config.online_minutes
+        return minutes is not None and self.counters.online_s >= 60 * minutes
+
+    def _tell_updates(self) -> None:
+        self.person.learning(f"update {self.counters.updates}")
+
+    @contextlib.contextmanager
+    def _background(self) -> Iterator[Agent]:
+        """The agent that acts in an episode: with asynchronous updates a copy, while the original learns beside it."""
+        if not self.config.async_updates:
+            yield self.agent
+            return
+        acting = replace(self.agent, policy=deepcopy(self.agent.policy))
+        with Background(lambda stop: self.updates(self.config.async_updates, until=stop)):
+            yield acting
+
+    def updates(
+        self, count: int, on_update: Callable[[], None] = lambda: None, until: Callable[[], bool] = lambda: False
+    ) -> None:
         """Gradient updates on batches from both stores, the next one put together meanwhile."""
         if not self.replay.episodes:  # without demonstrations learning begins after the first episode
             return
@@ -156,6 +239,8 @@ class Trainer:
                 on_update()
                 if self.should_stop():
                     raise Interrupted
+                if until():
+                    break
 
     def _update(self, batch: Batch) -> dict[str, Any]:
         try:
@@ -168,7 +253,8 @@ class Trainer:
     def take_up(self, places: Sequence[Place]) -> None:
         """Episodes that were finished after the last checkpoint: they count, and their updates are made again."""
         recipe, owed = self.config.recipe, 0
-        for place in places:
+        # By number: an episode that was discarded at first was stored after later ones.
+        for place in sorted(places, key=lambda place: place.number):
             self.metrics.write("episodes", place.note)
             self.counters.episodes, self.counters.env_steps = place.number + 1, int(place.note["env_steps"])
             owed += place.length * recipe.updates_per_step + recipe.updates_per_episode
@@ -181,11 +267,14 @@ class Trainer:
 
     def evaluate(self, phase: str, episodes: int) -> None:
         """Success rate of the deterministic policy; its random state is kept apart from training's."""
+        if not episodes:
+            return
 
         def look(_: int) -> None:
             if self.should_stop():
                 raise Interrupted
 
+        self.person.expect(None)
         films = self.config.eval.videos
         result = evaluate(self.agent, self.scenes, episodes, on_episode=look, film=films)
         if films:

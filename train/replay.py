@@ -20,6 +20,7 @@ __all__ = ["Episode", "Replay"]
 
 GIB = 2**30
 BATCHES = 4  # whose pictures are in memory at a time
+SAMPLED = [("start", int), ("length", int), ("terminated", bool), ("demo", bool), ("first", int), ("last", int)]
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Episode:
     low_dim: float32 [T + 1, P], normalised (None without state); pixels: per view uint8 [T + 1, 3, H, W];
     action: float32 [T, D] in [-1, 1]; reward: float32 [T].
     terminated: the last step really ended the task (success); otherwise time ran out and the last
-    observation's value still counts.
+    observation's value still counts. taught: the steps (first, one past the last) that a person drove.
     """
 
     low_dim: NDArray[Any] | None
@@ -38,6 +39,7 @@ class Episode:
     reward: NDArray[Any]
     terminated: bool
     success: bool
+    taught: tuple[tuple[int, int], ...] = ()
 
     def __len__(self) -> int:
         """Steps, T."""
@@ -55,9 +57,10 @@ class Episode:
 class Replay:
     """Everything seen, with the demonstrations (and relabelled successes) flagged.
 
-    Both stores of the paper are views of one: a sample comes from all episodes or from the flagged ones. The
-    demonstrations of the dataset come first and stay; behind them episodes go round in a ring, the oldest
-    making room once the capacity is used up.
+    Both stores of the paper are views of one: a sample comes from all episodes or from the flagged ones. Of an episode
+    that is not flagged, the steps that a person drove count as a demonstration all the same. The demonstrations of the
+    dataset come first and stay; behind them episodes go round in a ring, the oldest making room once the capacity is
+    used up.
     """
 
     def __init__(
@@ -89,7 +92,7 @@ class Replay:
         self._ring = 0  # first row behind them
         self._head = 0  # where the next episode goes
         self._reserved = 0
-        self._tables: dict[str, NDArray[Any]] = {}
+        self._sampled: NDArray[Any] | None = None
         self._buffers: dict[tuple[int, str], torch.Tensor] = {}
         self._turn = 0
         self._journal: Journal | None = None
@@ -144,7 +147,9 @@ class Replay:
         """
         arrays = self._checked(episode)
         start = self._head if self._head + len(episode) + 1 <= self.capacity else self._ring
-        place = Place(start, len(episode), episode.terminated, episode.success, demo, number, note or {})
+        place = Place(
+            start, len(episode), episode.terminated, episode.success, demo, number, note or {}, episode.taught
+        )
         if place.stop > self.capacity:
             raise ConfigError(
                 f"An episode of {len(episode)} steps does not fit behind the demonstrations: raise"
@@ -176,7 +181,7 @@ class Replay:
             self._journal.complete(place)
         self._label_reward(place)
         self._places[index] = place
-        self._tables = {}
+        self._sampled = None
         return True
 
     def forget(self, number: int) -> bool:
@@ -187,7 +192,7 @@ class Replay:
         place = self._places.pop(index)
         if self._journal is not None:
             self._journal.announce(place.start, place.stop)
-        self._tables = {}
+        self._sampled = None
         return True
 
     def sample(self, count: int, demo_count: int, rng: np.random.Generator) -> Batch:
@@ -218,8 +223,9 @@ class Replay:
 
     def _draw(self, count: int, demo_count: int, rng: np.random.Generator) -> tuple[NDArray[Any], NDArray[Any]]:
         """Episodes [B] and steps [B]."""
-        tables = self._table()
-        everything, demos = np.arange(self.episodes), np.flatnonzero(tables["demo"])
+        table = self._table()
+        everything, demos = np.arange(self.episodes), np.flatnonzero(table["demo"])
+        steps = table["last"] - table["first"]
         if (count and not len(everything)) or (demo_count and not len(demos)):
             raise DataError(
                 f"Cannot sample {count} + {demo_count}: the replay holds {len(everything)} episodes, of which "
@@ -227,21 +233,21 @@ class Replay:
             )
         parts = []
         for ids, size in ((everything, count), (demos, demo_count)):
-            weights = tables["length"][ids] / tables["length"][ids].sum() if self.by_step and size else None
+            weights = steps[ids] / steps[ids].sum() if self.by_step and size else None
             parts += [rng.choice(ids, size, p=weights)] if size else []
         episode = np.concatenate(parts)
-        return episode, rng.integers(0, tables["length"][episode])
+        return episode, rng.integers(table["first"][episode], table["last"][episode])
 
     def _assemble(self, episode: NDArray[Any], step: NDArray[Any]) -> Batch:
         """Transitions at the given steps [B] of the given episodes [B]."""
-        tables = self._table()
-        start, length = tables["start"][episode], tables["length"][episode]
+        table = self._table()
+        start, length = table["start"][episode], table["length"][episode]
         window = np.minimum(self.n_step, length - step)  # never past the end of the episode
         offsets = np.arange(self.n_step)
         inside = offsets < window[:, None]
         rewards = self._rows["reward"].take((start + step)[:, None] + np.where(inside, offsets, 0)).numpy() * inside
         reward = (rewards * self.discount**offsets).sum(-1, keepdims=True)
-        ended = (step + window == length) & tables["terminated"][episode]
+        ended = (step + window == length) & table["terminated"][episode]
         discount = np.where(ended, 0.0, self.discount**window)[:, None]
         return Batch(
             self._observation(start, step),
@@ -249,8 +255,17 @@ class Replay:
             torch.from_numpy(reward.astype(np.float32)),
             torch.from_numpy(discount.astype(np.float32)),
             self._observation(start, step + window),
-            torch.from_numpy(tables["demo"][episode][:, None].astype(np.float32)),
+            torch.from_numpy(self._shown(episode, step)[:, None].astype(np.float32)),
         )
+
+    def _shown(self, episode: NDArray[Any], step: NDArray[Any]) -> NDArray[Any]:
+        """Whether the steps [B] are of a demonstration, or driven by a person in an episode that is none."""
+        table = self._table()
+        shown: NDArray[Any] = table["demo"][episode]
+        for row in range(self.episodes, len(table)):
+            inside = (table["first"][row] <= step) & (step < table["last"][row])
+            shown = shown | (inside & (table["start"][episode] == table["start"][row]))
+        return shown
 
     def _observation(self, start: NDArray[Any], step: NDArray[Any]) -> Observation:
         """Stacked history that ends at `step`; before the first frame, the first frame is repeated."""
@@ -298,7 +313,7 @@ class Replay:
         """Forget the episodes of the run that lie in these rows."""
         kept = [p for i, p in enumerate(self._places) if i < self._fixed or p.stop <= start or p.start >= stop]
         if len(kept) < len(self._places):
-            self._places, self._tables = kept, {}
+            self._places, self._sampled = kept, None
 
     def _index(self, number: int) -> int | None:
         """Where the run's episode of that number stands among the places."""
@@ -310,14 +325,17 @@ class Replay:
 
     def _keep(self, place: Place) -> None:
         self._places.append(place)
-        self._tables = {}
+        self._sampled = None
 
-    def _table(self) -> dict[str, NDArray[Any]]:
-        """Places as arrays, [episodes] each."""
-        if not self._tables:
-            columns = ("start", "length", "terminated", "demo")
-            self._tables = {name: np.array([getattr(p, name) for p in self._places]) for name in columns}
-        return self._tables
+    def _table(self) -> NDArray[Any]:
+        """What is sampled: a row for each episode, and behind them one for each span that a person drove."""
+        if self._sampled is None:
+            rows = [(p.start, p.length, p.terminated, p.demo, 0, p.length) for p in self._places]
+            rows += [
+                (p.start, p.length, p.terminated, True, *span) for p in self._places if not p.demo for span in p.taught
+            ]
+            self._sampled = np.array(rows, dtype=SAMPLED)
+        return self._sampled
 
     # -- after a kill ----------------------------------------------------------------------------------------
 

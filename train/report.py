@@ -23,6 +23,7 @@ from .agent import Agent
 from .envs.registration import UR5eStationEnv
 from .evaluate import EVAL_SEED, Evaluation, evaluate, wilson_interval
 from .gym_env import GymEnvironment, OneScene
+from .stages import read_rows
 
 if TYPE_CHECKING:
     from .demo import DemoConfig
@@ -34,8 +35,6 @@ Frames = list[NDArray[Any]]
 
 def write_report(config: "DemoConfig", labels: Mapping[str, str], wall_s: float) -> dict[str, Any]:
     """Write report.html and summary.json into `config.output_dir`; returns the summary."""
-    from .demo import read_rows
-
     out = config.output_dir
     dropped = json.loads((out / "dropped.json").read_text())[0]  # the first step of the recipe
     evaluations = {name: read_rows(out / name / "evaluations.csv") for name in labels}

@@ -27,7 +27,7 @@ class Place:
     """Where an episode of T steps lies, and what it is.
 
     start: first of its T + 1 rows; number: how many episodes the run had before it; note: what the run wants to know of
-    it after a kill (its row of episodes.csv).
+    it after a kill (its row of episodes.csv); taught: the steps (first, one past the last) that a person drove.
     """
 
     start: int
@@ -37,11 +37,16 @@ class Place:
     demo: bool
     number: int = -1
     note: dict[str, Any] = field(default_factory=dict)
+    taught: tuple[tuple[int, int], ...] = ()
 
     @property
     def stop(self) -> int:
         """One past its last row."""
         return self.start + self.length + 1
+
+
+def _place(entry: dict[str, Any]) -> Place:
+    return Place(**{**entry, "taught": tuple((first, last) for first, last in entry.get("taught", ()))})
 
 
 class Rows:
@@ -123,7 +128,7 @@ class Journal:
         for number, line in enumerate(lines, start=1):
             try:
                 entry = json.loads(line)
-                place = Place(**entry["episode"]) if "episode" in entry else None
+                place = _place(entry["episode"]) if "episode" in entry else None
                 rows = (place.start, place.stop) if place else (int(entry["writing"][0]), int(entry["writing"][1]))
             except (ValueError, KeyError, TypeError, IndexError) as error:
                 raise DataError(

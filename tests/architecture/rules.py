@@ -50,7 +50,9 @@ SIBLINGS: dict[str, set[str]] = {
     # What LeRobot sees; the modules above know nothing of it.
     "base_config": _BASE | {"settings"},
     "base_policy": _BASE | _SETTINGS | {"model"},
-    "processors": _BASE | _SETTINGS,
+    "joint_goals": _BASE,
+    "fit_pictures": _BASE,
+    "processors": _BASE | _SETTINGS | {"joint_goals", "fit_pictures"},
     "configuration_cqn": _SETTINGS,
     "processor_cqn": {"configuration_cqn", "processors"},
     "modeling_cqn": {"base_policy", "configuration_cqn", "critic"},

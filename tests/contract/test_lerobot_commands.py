@@ -1,5 +1,6 @@
 """LeRobot's own commands on the policy: training with and without rewards, exact resume, evaluation."""
 
+import contextlib
 import json
 import shutil
 from pathlib import Path
@@ -140,14 +141,12 @@ def load_as_lerobot_eval(model: Path, env: EnvConfig) -> Agent:
 def test_a_loaded_policy_acts_as_the_trained_one(act_with: str, click: list[str], tmp_path: Path) -> None:
     """Through LeRobot's factory, with the pipelines, over a history: the same commands to the robot, exactly."""
     flags = ["--policy.frame_stack=2", f"--policy.act_with={act_with}", "--policy.tau=0.3", "--policy.lr=0.01"]
-    with ConsoleMonitor() as monitor, StopRequest() as stop:
-        trainer = build(parse([*TINY_RUN, *click, *flags, f"--output_dir={tmp_path / 'run'}"]), monitor, stop)
-    try:
+    with ConsoleMonitor() as monitor, StopRequest() as stop, contextlib.ExitStack() as stack:
+        config = parse([*TINY_RUN, *click, *flags, f"--output_dir={tmp_path / 'run'}"])
+        trainer = build(config, monitor, stop, stack)
         for _ in range(20):
             trainer.updates(1)
         trainer.save()
-    finally:
-        trainer.env.close()
     loaded = load_as_lerobot_eval(
         tmp_path / "run/checkpoints/last/pretrained_model", make_env_config("ur5e_station", obs_type="state")
     )

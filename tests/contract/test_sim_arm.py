@@ -1,10 +1,6 @@
 """The simulated arm and its leader through LeRobot's commands, in real time and faster."""
 
-import os
-import pty
 import re
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,9 +17,10 @@ from cqn_train.sim_arm.sim_ur5e import SimUR5e, from_robot_units, to_robot_units
 from cqn_train.sim_arm.world import WORLDS
 from lerobot_cqn.errors import ConfigError
 
+from .terminal import record_demonstrations
+
 pytest.importorskip("mujoco")
 PAN = np.array([1.0, 0, 0, 0, 0, 0])
-NEXT = b"n"  # as a person presses it: the episode, or the reset, is over
 
 
 @pytest.fixture
@@ -153,51 +150,9 @@ def test_wrong_settings(settings: dict[str, object], said: str) -> None:
     assert len(FAULTS) == 8
 
 
-class Terminal:
-    """A command on a terminal of its own, whose lines are read and whose keys are pressed."""
-
-    def __init__(self, *command: str, folder: Path) -> None:
-        self.master, slave = pty.openpty()
-        environment = {**os.environ, "HF_HUB_OFFLINE": "1", "DISPLAY": "", "TERM": "dumb"}
-        self.process = subprocess.Popen(
-            command, stdin=slave, stdout=slave, stderr=slave, cwd=folder, env=environment, close_fds=True
-        )
-        os.close(slave)
-        self.said = ""
-
-    def run(self, answers: dict[str, bytes], seconds: float) -> int:
-        """Press keys at the lines that ask for them; returns the exit code."""
-        deadline, unread = time.monotonic() + seconds, ""
-        while True:
-            assert time.monotonic() < deadline, self.said[-2000:]
-            try:
-                data = os.read(self.master, 4096).decode(errors="replace")
-            except OSError:  # the other end is closed
-                break
-            self.said += data
-            *lines, unread = (unread + data).split("\n")
-            for line in lines:
-                for text, key in answers.items():
-                    if text in line:
-                        os.write(self.master, key)
-        os.close(self.master)
-        return self.process.wait(30)
-
-
 def test_lerobot_record_mirrors_the_leader(tmp_path: Path) -> None:
     """As a person at the terminal: ends the episode when the task is done, and the reset when the arm is home."""
-    root = tmp_path / "demos"
-    terminal = Terminal(
-        str(Path(sys.executable).parent / "lerobot-record"),
-        "--robot.type=sim_ur5e", "--robot.id=sim", "--robot.speed=4", "--robot.camera_names=[upper_wrist]",
-        "--robot.state=true", "--teleop.type=sim_leader", "--teleop.id=leader", "--teleop.hold_s=0.4",
-        "--dataset.repo_id=local/demos", f"--dataset.root={root}", "--dataset.fps=40", "--dataset.num_episodes=3",
-        "--dataset.single_task=Press the red button.", "--dataset.episode_time_s=30", "--dataset.reset_time_s=30",
-        "--dataset.push_to_hub=false", "--play_sounds=false",
-        folder=tmp_path,
-    )  # fmt: skip
-    code = terminal.run({"sim_leader: home": NEXT, "sim_leader: wait": NEXT}, 150)
-    assert code == 0, terminal.said[-3000:]
+    root = record_demonstrations(tmp_path, "--robot.camera_names=[upper_wrist]", "--robot.state=true", episodes=3)
     rows = pd.concat([pd.read_parquet(file) for file in sorted(root.glob("data/**/*.parquet"))])
     lengths = rows.groupby("episode_index").size()
     assert len(lengths) == 3

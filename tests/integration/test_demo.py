@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from cqn_train.demo import DemoConfig, Stages
+from cqn_train.stages import Stages
 
 TINY = (
     "--demonstrations=3", "--offline_updates=4", "--steps=30", "--eval_freq=0", "--eval_episodes=1",
@@ -53,7 +53,7 @@ def test_what_a_cut_off_recording_left_is_not_taken_for_all_of_it(tmp_path: Path
     left = tmp_path / "data" / "unfiltered"
     left.mkdir(parents=True)
     (left / "part").write_text("of a recording")
-    stages = Stages(DemoConfig(output_dir=tmp_path), Console(quiet=True))
+    stages = Stages(tmp_path, Console(quiet=True))
     stages.run("record", "recording", left, "json.tool", "--help")
     assert not left.exists()
     assert [(path / "part").read_text() for path in left.parent.iterdir()] == ["of a recording"]

@@ -10,7 +10,9 @@ import pytest
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, PolicyFeature
 
-import cqn_train.envs  # noqa: F401  # registers the station
+import cqn_train.envs  # registers the station
+import cqn_train.sim_arm  # noqa: F401  # registers the arm
+from cqn_train.arguments import parse
 from cqn_train.config import Recipe, RunConfig
 from lerobot_cqn import settings as settings_module
 from lerobot_cqn.configuration_cqn import CQNConfig
@@ -175,6 +177,63 @@ def test_runs_are_checked() -> None:
     for option in ("save_freq", "log_freq"):
         with pytest.raises(ConfigError, match=f"`{option}` must be at least 1, got 0"):
             validate(f"--{option}=0")
+
+
+ARM = ["--robot.type=sim_ur5e", "--output_dir=x", "--dataset.repo_id=a/b"]
+
+
+def arm_run(*arguments: str) -> RunConfig:
+    return parse(["--policy.type=cqn", "--policy.device=cpu", *ARM, *arguments])
+
+
+def test_runs_on_an_arm_have_defaults_of_their_own() -> None:
+    run = arm_run("--teleop.type=sim_leader")
+    run.validate()
+    assert (run.recipe.updates_per_step, run.recipe.updates_per_episode) == (0, 50)  # the paper's on a real arm
+    assert (run.eval_freq, run.final_episodes) == (0, 0)
+    asked = arm_run("--updates_per_episode=7", "--eval.freq=100", "--eval.final_n_episodes=5", "--async_updates=9")
+    asked.validate()
+    assert (asked.recipe.updates_per_episode, asked.eval_freq, asked.final_episodes) == (7, 100, 5)
+    assert arm_run("--policy.preset=laptop_pixels").recipe.updates_per_episode == 25
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--env.type=ur5e_station"], "either an environment or an arm"),
+        (["--updates_per_step=1"], "would make the arm jerk"),
+        (["--eval.batch_size=2"], "There is one arm"),
+        (["--eval.use_async_envs=true"], "There is one arm"),
+        (["--online_minutes=0"], "`online_minutes` must be positive, got 0"),
+        (["--async_updates=-1"], "`async_updates` must be at least 0, got -1"),
+        (["--eval.freq=-1"], r"`eval\.freq` must be at least 0, got -1"),
+        (["--page.port=65536"], r"`page\.port` must be 0 to 65535"),
+        (["--page.absent_s=0.5"], r"`page\.absent_s` must be 1 to 3600 seconds, got 0\.5"),
+        (["--arm.fps=0"], r"`arm\.fps` must be 1 to 1000, got 0"),
+        (["--arm.episode_s=0"], r"`arm\.episode_s` must be 0\.1 to 3600"),
+        (["--arm.joint_margin=-0.1"], r"`arm\.joint_margin` must be 0 to 1"),
+        (["--arm.step_factor=0"], r"`arm\.step_factor` must be 0\.1 to 100"),
+        (["--arm.home_speed=0"], r"`arm\.home_speed` must be 0\.001 to 1"),
+        (["--arm.home_speed=1.5"], r"`arm\.home_speed` must be"),
+        (["--arm.stale_s=0"], r"`arm\.stale_s` must be"),
+        (["--arm.watchdog_s=60"], r"`arm\.watchdog_s` must be 0\.05 to 10"),
+        (["--arm.watchdog_s=nan"], r"`arm\.watchdog_s` must be"),
+        (['--arm.joint_limits={"elbow.pos": [3, 1]}'], r"`arm\.joint_limits` of 'elbow\.pos' must be \[low, high\]"),
+        (['--arm.joint_limits={"elbow.pos": [3]}'], "must be \\[low, high\\]"),
+        (["--arm.workspace=[0,1,0,1,0]"], r"`arm\.workspace` must be \[x_low"),
+        (["--arm.workspace=[0,1,0,1,1,0]"], r"`arm\.workspace` must be \[x_low"),
+        (["--arm.on_exit=relase"], r"Unknown arm\.on_exit 'relase'.*Did you mean 'release'"),
+    ],
+)
+def test_what_an_arm_cannot_be_told(arguments: list[str], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        arm_run(*arguments).validate()
+
+
+def test_a_leader_needs_an_arm() -> None:
+    config = ["--policy.type=cqn", "--policy.device=cpu", "--env.type=ur5e_station", "--teleop.type=sim_leader"]
+    with pytest.raises(ConfigError, match=r"leader of an arm: give --robot\.type"):
+        parse([*config, "--output_dir=x", "--dataset.repo_id=a/b"]).validate()
 
 
 def test_help_names_every_preset() -> None:

@@ -6,11 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cqn_train import interfaces
 from cqn_train.operator_page.session import TRANSITIONS, Event, Label, RefusedError, Session, State
 
 # What a person would expect, written down on its own: state -> event -> next state; the rest is refused.
 EXPECTED = {
-    "waiting": {"start": "running"},
+    "waiting": {"start": "running", "home": "waiting", "free": "waiting"},
     "running": {
         "pause": "paused", "absent": "paused", "take_over": "teaching", "time_up": "labelling", "success": "resetting",
         "failure": "resetting", "discard": "resetting",
@@ -24,7 +25,7 @@ EXPECTED = {
         "failure": "resetting", "discard": "resetting",
     },
     "labelling": {"success": "resetting", "failure": "resetting", "discard": "resetting"},
-    "resetting": {"ready": "waiting"},
+    "resetting": {"ready": "waiting", "home": "resetting", "free": "resetting"},
     "faulted": {"recovered": "resetting"},
     "stopped": {},
 }  # fmt: skip
@@ -83,6 +84,10 @@ def test_whatever_happens(sequence: list[Event]) -> None:
             assert made.state is before
             continue
         applied += 1
+        if event in ("success", "failure", "discard"):
+            assert made.busy
+            made.learning("")  # the learner is quick
+            applied += 1
         started += event is Event.START
         stopped = stopped or event is Event.STOP
         assert made.episode == started - 1
@@ -132,16 +137,127 @@ def test_relabelling() -> None:
 
 
 def test_a_person_is_offered_what_is_possible() -> None:
-    assert session(State.WAITING).allowed() == [Event.STOP, Event.START]
+    assert session(State.WAITING).allowed() == [Event.STOP, Event.START, Event.HOME, Event.FREE]
     assert Event.TIME_UP not in session(State.RUNNING).allowed()
+    assert Label is interfaces.Label
 
 
-def press(event: Event, made: Session, barrier: threading.Barrier, refused: list[Event]) -> None:
-    barrier.wait()
-    try:
+def refused(made: Session, event: Event, said: str) -> None:
+    """The event is neither offered nor possible, and changes nothing."""
+    before = made.snapshot()
+    assert event not in made.allowed()
+    with pytest.raises(RefusedError, match=said):
         made.apply(event)
-    except RefusedError:
-        refused.append(event)
+    assert made.snapshot() == before
+
+
+def test_no_episode_starts_while_the_learner_is_busy() -> None:
+    made = Session()
+    made.learning("offline updates")
+    refused(made, Event.START, r"busy \(offline updates\)")
+    made.learning("")
+    made.apply(Event.START)
+    for event in (Event.SUCCESS, Event.FAILURE, Event.DISCARD):
+        made.apply(event)  # its end makes the learner busy, before it could say so itself
+        made.apply(Event.READY)
+        refused(made, Event.START, "storing the episode")
+        assert made.snapshot()["busy"] == "storing the episode"
+        made.learning("")
+        assert made.apply(Event.START) is State.RUNNING
+
+
+def test_without_a_leader_nobody_takes_over() -> None:
+    for path in (PATHS[State.RUNNING], PATHS[State.PAUSED]):
+        made = Session(leader=False)
+        for event in path:
+            made.apply(event)
+        refused(made, Event.TAKE_OVER, "There is no leader arm")
+
+
+def test_an_evaluation_is_the_policys_alone_and_not_learned_from() -> None:
+    made = Session()
+    made.expect(None)
+    made.apply(Event.START)
+    assert made.episode == -1
+    refused(made, Event.TAKE_OVER, "An evaluation is on")
+    made.apply(Event.SUCCESS)
+    made.learning("")
+    made.expect(7)
+    with pytest.raises(RefusedError, match="Evaluations are not learned from"):
+        made.relabel(-1, Label.FAILURE)
+    made.apply(Event.READY)
+    made.apply(Event.START)
+    assert made.episode == 7
+    assert Event.TAKE_OVER in made.allowed()
+    made.apply(Event.FAILURE)
+    made.learning("")
+    made.expect(None)
+    made.apply(Event.READY)
+    made.apply(Event.START)
+    assert made.episode == -2
+
+
+def test_an_episode_that_is_tried_again_has_no_label_of_before() -> None:
+    made = session(State.RESETTING)
+    made.learning("")
+    made.expect(0)
+    made.apply(Event.READY)
+    made.apply(Event.START)
+    assert (made.episode, made.labels) == (0, {})
+
+
+def test_breaks_are_counted_once_each() -> None:
+    made = session(State.RUNNING)
+    assert made.breaks == 0
+    made.apply(Event.PAUSE)
+    made.apply(Event.RESUME)
+    assert made.breaks == 1
+    made.apply(Event.TAKE_OVER)
+    assert made.breaks == 1
+    made.apply(Event.ABSENT)
+    assert made.breaks == 2
+    made.apply(Event.FAULT, "one")
+    made.apply(Event.FAULT, "and the same still")
+    assert made.breaks == 3
+    made.apply(Event.RECOVERED)
+    made.apply(Event.FAILURE)
+    assert made.breaks == 3
+
+
+def test_going_home_is_asked_once_and_forgotten_by_what_comes_next() -> None:
+    for state in (State.WAITING, State.RESETTING):
+        made = session(state)
+        assert not made.take_home()
+        made.apply(Event.HOME)
+        assert made.take_home()
+        assert not made.take_home()
+    made = session(State.RESETTING)
+    made.learning("")
+    made.apply(Event.HOME)
+    made.apply(Event.READY)  # the scene is ready while the arm is on its way
+    assert made.take_home()
+    made.apply(Event.HOME)
+    made.apply(Event.START)
+    assert not made.take_home()
+
+
+def test_an_arm_is_let_go_and_taken_again() -> None:
+    refused(Session(can_free=False), Event.FREE, "no motor bus")
+    made = session(State.RESETTING)
+    made.learning("")
+    made.apply(Event.HOME)
+    made.apply(Event.FREE)
+    assert made.free
+    assert not made.take_home()  # nobody holds an arm that begins to move by itself
+    made.apply(Event.READY)
+    assert made.free
+    made.apply(Event.FREE)
+    assert not made.free
+    for event in (Event.HOME, Event.START, Event.FAULT, Event.STOP):
+        made = session(State.WAITING)
+        made.apply(Event.FREE)
+        made.apply(event)
+        assert not made.free
 
 
 def test_of_two_people_who_press_at_once_one_is_refused() -> None:

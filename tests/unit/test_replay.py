@@ -1,5 +1,8 @@
 """The replay against a loop that takes one step after the other."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -196,3 +199,121 @@ def test_shapes_must_fit_and_steps_must_exist() -> None:
     blurred = Episode(other.low_dim, (other.pixels[0][..., :2],), other.action, other.reward, True, True)
     with pytest.raises(DataError, match="do not fit"):
         replay.add(blurred, demo=True)
+
+
+# -- steps that a person drove ---------------------------------------------------------------------------------------
+
+Spans = tuple[tuple[int, int], ...]
+taught_episodes = st.lists(
+    st.tuples(st.lists(st.booleans(), min_size=1, max_size=9), st.booleans(), st.booleans()), min_size=1, max_size=6
+)  # who drove each step, whether it succeeded, whether that makes it a demonstration
+
+
+def spans_of(flags: list[bool]) -> Spans:
+    """Runs of True, one step after the other."""
+    spans: list[tuple[int, int]] = []
+    for step, flag in enumerate(flags):
+        if flag and spans and spans[-1][1] == step:
+            spans[-1] = (spans[-1][0], step + 1)
+        elif flag:
+            spans.append((step, step + 1))
+    return tuple(spans)
+
+
+def add_taught(replay: Replay, number: int, flags: list[bool], *, success: bool = False, demo: bool = False) -> None:
+    """An episode of the run, in which a person drove the flagged steps."""
+    episode = replace(make_episode(number, len(flags), terminated=success), taught=spans_of(flags))
+    replay.add(episode, demo=demo, number=number)
+
+
+def stores(replay: Replay) -> tuple[set[tuple[int, int]], set[tuple[int, int]]]:
+    """Steps (episode, step) in both stores, as sampled; the flag of every row is checked on the way."""
+    demos = bool(len(np.flatnonzero(replay._table()["demo"])))
+    batch = replay.sample(2500, 2500 if demos else 0, np.random.default_rng(0))
+    places = [locate(batch, row) for row in range(len(batch.action))]
+    everything, shown = set(places[:2500]), set(places[2500:])
+    # A step is shown wherever it comes from: the loss on demonstrations must see it in both halves.
+    assert [place in shown for place in places] == batch.demo[:, 0].bool().tolist()
+    return everything, shown
+
+
+def expected(episodes: dict[int, tuple[list[bool], bool]]) -> tuple[set[tuple[int, int]], set[tuple[int, int]]]:
+    """Episodes are number: (who drove, whether it is a demonstration)."""
+    everything = {(number, t) for number, (flags, _) in episodes.items() for t in range(len(flags))}
+    return everything, {(n, t) for n, t in everything if episodes[n][1] or episodes[n][0][t]}
+
+
+@settings(max_examples=40, deadline=None)
+@given(taught_episodes, st.booleans())
+def test_steps_of_a_person_are_demonstrations_whatever_became_of_the_episode(
+    made: list[tuple[list[bool], bool, bool]], by_step: bool
+) -> None:
+    replay = Replay(2, 3, GAMMA, by_step=by_step)
+    held: dict[int, tuple[list[bool], bool]] = {}
+    for number, (flags, success, relabel) in enumerate(made):
+        add_taught(replay, number, flags, success=success, demo=success and relabel)
+        held[number] = flags, success and relabel
+    assert stores(replay) == expected(held)
+    assert replay.demonstrations == sum(demo for _, demo in held.values())  # whole episodes only
+
+
+@settings(max_examples=30, deadline=None)
+@given(taught_episodes, st.data())
+def test_relabelling_and_forgetting_leave_what_a_person_drove(
+    made: list[tuple[list[bool], bool, bool]], data: st.DataObject
+) -> None:
+    replay, held = Replay(1, 2, GAMMA), dict[int, tuple[list[bool], bool]]()
+    for number, (flags, *_) in enumerate(made):
+        add_taught(replay, number, flags)
+        held[number] = flags, False
+    for _ in range(4):
+        number = data.draw(st.sampled_from(range(len(made))))
+        change = data.draw(st.sampled_from(["success", "failure", "discard"]))
+        there = number in held
+        if change == "discard":
+            assert replay.forget(number) == there
+            held.pop(number, None)
+        else:
+            assert replay.relabel(number, success=change == "success", demo=change == "success") == there
+            if there:
+                held[number] = held[number][0], change == "success"
+    if held:
+        assert stores(replay) == expected(held)
+
+
+def test_what_makes_room_takes_its_taught_steps_along() -> None:
+    row = 2 * 4 + D * 4 + 4
+    replay = Replay(1, 1, GAMMA, capacity_gib=14 * row / 2**30)
+    replay.add_demonstration(make_episode(0, 3))
+    flags = [False, True, True, False]
+    for number in (1, 2, 3):  # room for two of them: the third lies where the first was
+        add_taught(replay, number, flags if number != 2 else [False] * 4)
+    assert stores(replay) == expected({0: ([False] * 3, True), 2: ([False] * 4, False), 3: (flags, False)})
+
+
+def test_taught_steps_are_found_again_by_a_later_process(tmp_path: Path) -> None:
+    first = Replay(1, 1, GAMMA, folder=tmp_path)
+    flags = {0: [True, False, True, True], 1: [False, True], 2: [True, True, False], 3: [True]}
+    for number, driven in flags.items():
+        add_taught(first, number, driven)
+    first.relabel(1, success=True, demo=True)
+    first.relabel(2, success=True, demo=True)
+    first.relabel(2, success=False, demo=False)
+    first.forget(3)
+    second = Replay(1, 1, GAMMA, folder=tmp_path)
+    assert [place.taught for place in second.reopen()] == [spans_of(flags[n]) for n in range(3)]
+    assert stores(second) == expected({0: (flags[0], False), 1: (flags[1], True), 2: (flags[2], False)})
+
+
+def test_shown_steps_weigh_the_same_when_steps_are_sampled() -> None:
+    replay = Replay(1, 1, GAMMA, by_step=True)
+    replay.add(make_episode(0, 20), demo=True)
+    add_taught(replay, 1, [True] * 3 + [False] * 50 + [True] * 17)
+    count = 20_000
+    batch = replay.sample(count, count, np.random.default_rng(5))
+    places = [locate(batch, row) for row in range(2 * count)]
+    shown = np.bincount([20 * number + (t if t < 20 else t - 50) for number, t in places[count:]], minlength=40)
+    assert len(shown) == 40
+    assert ((shown - count / 40) ** 2 / (count / 40)).sum() < 73  # 39 degrees of freedom, 0.1 %
+    everything = sum(number == 1 for number, _ in places[:count])  # 70 of 90 steps, taught or not
+    assert abs(everything / count - 70 / 90) < 0.012  # four standard deviations

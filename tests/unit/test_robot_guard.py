@@ -26,11 +26,18 @@ def limits(**changes: Any) -> Limits:
     return Limits(**{**ranges, "max_speed": np.full(D, 50.0), **changes})
 
 
-@given(vectors, vectors, vectors, st.floats(0.001, 0.5))
+@given(vectors, vectors, arrays(np.float64, D, elements=st.floats(-90, 90)), st.floats(0.001, 0.5))
 def test_a_goal_is_always_inside_the_joint_limits(wanted: Any, measured: Any, last: Any, seconds: float) -> None:
     goal = allowed_goal(wanted, measured, last, seconds, limits()).goal
     assert (goal >= -90).all()
     assert (goal <= 90).all()
+
+
+@given(vectors, vectors, st.floats(0.001, 0.5))
+def test_an_arm_outside_its_limits_comes_in_without_a_leap(wanted: Any, place: Any, seconds: float) -> None:
+    goal = allowed_goal(wanted, place, place, seconds, limits()).goal
+    assert np.abs(goal - place).max() <= min(5.0, 50.0 * seconds) + 1e-9
+    assert (np.abs(goal) <= np.maximum(90, np.abs(place))).all()  # and never farther out
 
 
 @given(vectors, arrays(np.float64, D, elements=st.floats(-80, 80)), st.floats(0.01, 0.5))
@@ -94,6 +101,7 @@ class Motors:
         self.on_send: Callable[[], None] = lambda: None
         self.picture = np.zeros((4, 4, 3), np.uint8)
         self.noise = 0
+        self.bus: Any = None
 
     action_features = dict.fromkeys(NAMES, float)
 

@@ -244,6 +244,14 @@ class Arm:
         """Point between the closed fingertips, (3,) m in the world."""
         return np.array(self.data.site_xpos[self._tip])
 
+    def tip_at(self, joints: Array) -> Array:
+        """Position that the tip would have at other joint angles (6,) rad, m."""
+        elsewhere = self._mujoco.MjData(self.model)
+        elsewhere.qpos[:] = self.data.qpos
+        elsewhere.qpos[self._qpos] = joints
+        self._mujoco.mj_kinematics(self.model, elsewhere)
+        return np.array(elsewhere.site_xpos[self._tip])
+
     @property
     def tip_rotation(self) -> Array:
         """Tool frame in the world, (3, 3); z points out of the gripper, y from finger to finger."""

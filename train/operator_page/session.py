@@ -2,7 +2,8 @@
 
 An episode runs from `start` to `success`, `failure` or `discard`, by a person's hand; in between it may be paused, or
 driven by the person (`take_over`). When its time is up it waits for its label. Then the person resets the scene, and
-the next one may start. A fault leads to FAULTED from everywhere, `stop` to STOPPED, which nothing leaves.
+the next one may start; meanwhile the arm goes home when asked to, or lets itself be moved by hand (`free`). A fault
+leads to FAULTED from everywhere, `stop` to STOPPED, which nothing leaves.
 """
 
 import threading
@@ -12,6 +13,8 @@ from enum import StrEnum
 from typing import Any
 
 from lerobot_cqn.errors import CQNError
+
+from ..interfaces import Label
 
 __all__ = ["TRANSITIONS", "Event", "Label", "RefusedError", "Session", "State"]
 
@@ -41,19 +44,13 @@ class Event(StrEnum):
     TAKE_OVER = "take_over"
     HAND_BACK = "hand_back"
     READY = "ready"
+    HOME = "home"
+    FREE = "free"
     STOP = "stop"
     TIME_UP = "time_up"
     ABSENT = "absent"
     FAULT = "fault"
     RECOVERED = "recovered"
-
-
-class Label(StrEnum):
-    """How an episode went."""
-
-    SUCCESS = "success"
-    FAILURE = "failure"
-    DISCARD = "discard"  # neither: not to be learned from
 
 
 LABELS: Mapping[Event, Label] = {
@@ -65,7 +62,7 @@ IN_EPISODE = frozenset({State.RUNNING, State.PAUSED, State.TEACHING, State.LABEL
 _ENDS = dict.fromkeys(LABELS, State.RESETTING)
 _ALWAYS = {Event.STOP: State.STOPPED, Event.FAULT: State.FAULTED}
 TRANSITIONS: Mapping[State, Mapping[Event, State]] = {
-    State.WAITING: {**_ALWAYS, Event.START: State.RUNNING},
+    State.WAITING: {**_ALWAYS, Event.START: State.RUNNING, Event.HOME: State.WAITING, Event.FREE: State.WAITING},
     State.RUNNING: {
         **_ALWAYS, **_ENDS, Event.PAUSE: State.PAUSED, Event.ABSENT: State.PAUSED,
         Event.TAKE_OVER: State.TEACHING, Event.TIME_UP: State.LABELLING,
@@ -76,7 +73,9 @@ TRANSITIONS: Mapping[State, Mapping[Event, State]] = {
         Event.TIME_UP: State.LABELLING,
     },
     State.LABELLING: {**_ALWAYS, **_ENDS},
-    State.RESETTING: {**_ALWAYS, Event.READY: State.WAITING},
+    State.RESETTING: {
+        **_ALWAYS, Event.READY: State.WAITING, Event.HOME: State.RESETTING, Event.FREE: State.RESETTING,
+    },
     # What was going on is over; where an episode was, a person says how it went (see `Session.apply`).
     State.FAULTED: {Event.STOP: State.STOPPED, Event.FAULT: State.FAULTED, Event.RECOVERED: State.RESETTING},
     State.STOPPED: {Event.STOP: State.STOPPED},
@@ -93,9 +92,14 @@ class Session:
 
     Attributes:
         state: what is going on.
-        episode: number of the episode that runs or ran last; -1 before the first.
+        episode: number of the episode that runs or ran last, from 0; evaluations count down from -1.
+        evaluating: whether the next episode is an evaluation, which the policy must do alone.
         labels: of the finished episodes, by number.
         fault: what the robot said last, "" while all is well.
+        busy: what the learner is at, "" while it is ready; no episode starts meanwhile. The end of an episode sets it.
+        breaks: how often an episode was paused or broken off by a fault, in all.
+        leader: whether there is a leader arm to take over with; can_free: whether the arm can be moved by hand.
+        free: whether it is to be moved by hand now; every event but READY ends that.
         on_change: called after each change, with the lock held: must be quick and must not raise.
     """
 
@@ -104,6 +108,15 @@ class Session:
     episode: int = -1
     labels: dict[int, Label] = field(default_factory=dict)
     fault: str = ""
+    busy: str = ""
+    breaks: int = 0
+    leader: bool = True
+    can_free: bool = True
+    free: bool = False
+    evaluating: bool = False
+    _next: int = 0
+    _evaluations: int = 0
+    _home: bool = False
     _unlabelled: bool = False
     _relabelled: dict[int, Label] = field(default_factory=dict)
     _lock: threading.RLock = field(default_factory=threading.RLock, repr=False)
@@ -118,18 +131,29 @@ class Session:
                 raise RefusedError(
                     f"'{event}' has no place while {self.state}: expected one of {', '.join(self.allowed())}."
                 )
+            if event is Event.START and self.busy:
+                raise RefusedError(f"An episode cannot start while the learner is busy ({self.busy}): wait for it.")
+            if event is Event.TAKE_OVER and self.evaluating:
+                raise RefusedError("An evaluation is on: the policy must do it alone; discard it, or wait.")
+            if event is Event.TAKE_OVER and not self.leader:
+                raise RefusedError("There is no leader arm to take over with: start the run with --teleop.type=...")
+            if event is Event.FREE and not self.can_free:
+                raise RefusedError("This robot cannot be moved by hand: it has no motor bus that lets go.")
             before, after = self.state, TRANSITIONS[self.state][event]
             if event is Event.START:
-                self.episode += 1
+                self._count()
+            self.free = not self.free if event is Event.FREE else self.free and event is Event.READY
+            self._home = event is Event.HOME or (self._home and event is Event.READY)
             if event in LABELS:
                 self.labels[self.episode] = LABELS[event]
-                self._unlabelled = False
+                self._unlabelled, self.busy = False, "storing the episode"
             if event is Event.FAULT:
                 self.fault = detail or self.fault
                 self._unlabelled = self._unlabelled or before in IN_EPISODE
             if event is Event.RECOVERED:
                 self.fault = ""
                 after = State.LABELLING if self._unlabelled else after
+            self.breaks += after in (State.PAUSED, State.FAULTED) and before is not after
             self.state = after
             self.on_change(self)
             return after
@@ -137,6 +161,8 @@ class Session:
     def relabel(self, episode: int, label: Label) -> None:
         """Say otherwise how a finished episode went. Raises RefusedError for one that has no label yet."""
         with self._lock:
+            if episode < 0:
+                raise RefusedError("Evaluations are not learned from: only episodes of the run can be relabelled.")
             if episode not in self.labels:
                 known = f"0 to {max(self.labels)}" if self.labels else "none yet"
                 raise RefusedError(f"Episode {episode} has no label to change: finished episodes are {known}.")
@@ -151,16 +177,51 @@ class Session:
             taken, self._relabelled = self._relabelled, {}
             return taken
 
+    def expect(self, number: int | None) -> None:
+        """Say which episode of the run starts next; None: evaluations, which have numbers of their own."""
+        with self._lock:
+            self.evaluating = number is None
+            self._next = self._next if number is None else number
+            self.on_change(self)
+
+    def _count(self) -> None:
+        if self.evaluating:
+            self._evaluations += 1
+            self.episode = -self._evaluations
+        else:
+            self.episode, self._next = self._next, self._next + 1
+            self.labels.pop(self.episode, None)  # of a try that was interrupted
+
+    def learning(self, doing: str) -> None:
+        """Say what the learner is at, "" when it is done: no episode starts meanwhile."""
+        with self._lock:
+            self.busy = doing
+            self.on_change(self)
+
+    def take_home(self) -> bool:
+        """Whether the arm is to go home, for whoever moves it; asked once."""
+        with self._lock:
+            asked, self._home = self._home, False
+            return asked
+
     def allowed(self) -> list[Event]:
         """What a person may do now."""
         with self._lock:
-            return [event for event in TRANSITIONS[self.state] if event not in BY_ITSELF]
+            events = [event for event in TRANSITIONS[self.state] if event not in BY_ITSELF]
+            return [
+                event
+                for event in events
+                if not (event is Event.START and self.busy)
+                and not (event is Event.TAKE_OVER and (self.evaluating or not self.leader))
+                and not (event is Event.FREE and not self.can_free)
+            ]
 
     def snapshot(self) -> dict[str, Any]:
         """All of it as plain values, for a page or a log."""
         with self._lock:
             return {
-                "state": str(self.state), "episode": self.episode, "fault": self.fault,
+                "state": str(self.state), "episode": self.episode, "fault": self.fault, "busy": self.busy,
+                "evaluating": self.evaluating, "free": self.free,
                 "allowed": [str(event) for event in self.allowed()],
                 "labels": {str(number): str(label) for number, label in self.labels.items()},
             }  # fmt: skip

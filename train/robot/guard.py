@@ -23,9 +23,16 @@ Array = NDArray[np.float64]
 class RobotFault(CQNError, RuntimeError):  # noqa: N818  # what people call it
     """The robot cannot be read or moved, or what it says cannot be true; the arm is held where that is possible."""
 
+    def __init__(self, text: str) -> None:
+        super().__init__(" ".join(text.split()))  # drivers' errors have many lines
+
 
 class StoppedError(CQNError, RuntimeError):
     """A goal came after the stop; nothing is sent any more."""
+
+
+class HeldError(CQNError, RuntimeError):
+    """A goal came when the arm may not move, for example just after a pause; it was not sent."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +85,7 @@ class Guard:
         self._measured: Array | None = None
         self._trusted = True  # whether the joints that were read last can be believed
         self._sent_at = self._asked_at = self._read_at = clock()
-        self._held = True
+        self._held, self._released = True, False
         self._changed_at: dict[str, float] = {}
         self._before: dict[str, Any] = {}
         self._watchdog: threading.Thread | None = None
@@ -86,24 +93,35 @@ class Guard:
     # -- life ------------------------------------------------------------------------------------------------
 
     def __enter__(self) -> "Guard":
-        if not self.robot.is_connected:
-            self.robot.connect()
-        self.read()
-        self._watchdog = threading.Thread(target=self._watch, name="watchdog", daemon=True)
-        self._watchdog.start()
+        self.open()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def close(self) -> None:
-        """Leave the arm holding and disconnect; whatever goes wrong on the way, the next step is still tried."""
+    def open(self) -> None:
+        """Connect, read once, start the watchdog. Raises RobotFault when the robot does not answer."""
+        try:
+            if not self.robot.is_connected:
+                self.robot.connect()
+        except CQNError:
+            raise
+        except Exception as error:  # drivers raise many kinds
+            raise RobotFault(f"The robot cannot be connected: {error} Check cables, power and --robot.port.") from error
+        self.read()
+        self._watchdog = threading.Thread(target=self._watch, name="watchdog", daemon=True)
+        self._watchdog.start()
+
+    def close(self, *, release: bool = False) -> None:
+        """Leave the arm holding, or released, and disconnect; whatever goes wrong, the rest is still tried."""
         self._closing.set()
         if self._watchdog is not None:
             self._watchdog.join(2 * self.settings.watchdog_s)
         with self._lock:
             with contextlib.suppress(Exception):
                 self._hold()
+                if release:
+                    self.release()
             if self.robot.is_connected:
                 self.robot.disconnect()
 
@@ -115,14 +133,14 @@ class Guard:
             begun = self._clock()
             try:
                 raw = self.robot.get_observation()
-            except Exception as error:  # drivers raise many kinds
+                joints = np.array([float(raw[name]) for name in self.names])
+            except Exception as error:  # drivers raise many kinds, or leave a joint out
                 raise RobotFault(f"The robot cannot be read: {error} Check cables and power.") from error
             now = self._clock()
             if now - begun > self.settings.slow_s:
                 raise RobotFault(
                     f"Reading the robot took {now - begun:.1f} s, expected at most {self.settings.slow_s:g} s."
                 )
-            joints = np.array([float(raw[name]) for name in self.names])
             self._trusted = False
             if not np.isfinite(joints).all():
                 bad = self.names[int(np.flatnonzero(~np.isfinite(joints))[0])]
@@ -136,7 +154,7 @@ class Guard:
 
     def _check_fresh(self, joints: Array, pictures: Mapping[str, NDArray[np.uint8]], now: float) -> None:
         """What does not change at all has not been measured: noise alone makes real readings differ."""
-        moving = self._goal is not None and np.abs(self._goal - joints).max() > 0.2 * self.limits.max_step.max()
+        moving = self._goal is not None and (np.abs(self._goal - joints) > 0.5 * self.limits.max_step).any()
         values: dict[str, NDArray[Any]] = {"joints": joints, **pictures}
         for name, value in values.items():
             same = name in self._before and np.array_equal(value, self._before[name])
@@ -148,16 +166,32 @@ class Guard:
                     f"{what} not changed for {now - self._changed_at[name]:.1f} s: it is frozen or disconnected."
                 )
 
+    @property
+    def joints(self) -> Array:
+        """Joints [D] as read last. Raises RobotFault before the first reading."""
+        if self._measured is None:
+            raise RobotFault("The robot was not read yet.")
+        return self._measured.copy()
+
+    @property
+    def goal(self) -> Array:
+        """Goal [D] that was sent last; the joints before the first one."""
+        return self.joints if self._goal is None else self._goal.copy()
+
     # -- moving ----------------------------------------------------------------------------------------------
 
-    def send(self, wanted: Array) -> Array:
+    def send(self, wanted: Array, may_move: Callable[[], bool] = lambda: True) -> Array:
         """Send the nearest goal [D] that the limits allow; returns it.
 
-        Raises StoppedError after `stop`, RobotFault when the robot does not take it.
+        may_move: asked while nobody else can send, so that no goal comes after the `hold` of a pause.
+        Raises StoppedError after `stop`, HeldError where the arm may not move, RobotFault when the robot does not take
+        the goal.
         """
         with self._lock:
             if self._stopped.is_set():
                 raise StoppedError("The arm was stopped: start again to move it.")
+            if self._released or not may_move():
+                raise HeldError("The arm may not move now.")
             now = self._clock()
             if self._measured is None or self._goal is None:
                 self.read()
@@ -176,9 +210,13 @@ class Guard:
         with self._lock:
             self._hold()
 
+    def refuse(self) -> None:
+        """Refuse every goal from now on, without waiting for anything; `stop` holds the arm as well."""
+        self._stopped.set()
+
     def stop(self) -> None:
         """Hold, and refuse every goal from now on; may be called from any thread, at any time, repeatedly."""
-        self._stopped.set()  # before the lock: a goal that waits for it is refused as well
+        self.refuse()  # before the lock: a goal that waits for it is refused as well
         with self._lock, contextlib.suppress(RobotFault):
             self._hold()
 
@@ -187,12 +225,62 @@ class Guard:
         """Whether `stop` was called."""
         return self._stopped.is_set()
 
+    def release(self) -> None:
+        """Let a person move the arm by hand; no goal is sent before `engage`. Raises RobotFault where it cannot be."""
+        with self._lock:
+            self._torque(on=False)
+            self._released = True
+
+    def engage(self) -> None:
+        """Hold the arm where it is now, after `release`. Raises RobotFault when the robot does not do it."""
+        with self._lock:
+            if self._released:
+                # Before the motors hold again: they would leap to the goal that they were given last.
+                self._transmit(self.read().joints)
+                self._torque(on=True)
+                self._released = False
+                self._hold()
+
+    @property
+    def released(self) -> bool:
+        """Whether a person may move the arm by hand."""
+        return self._released
+
+    @property
+    def can_release(self) -> bool:
+        """Whether the robot's motors can be switched off and on, as LeRobot's motor buses can."""
+        bus = getattr(self.robot, "bus", None)
+        return callable(getattr(bus, "disable_torque", None)) and callable(getattr(bus, "enable_torque", None))
+
+    def _torque(self, *, on: bool) -> None:
+        if not self.can_release:
+            raise RobotFault("This robot cannot be moved by hand: it has no motor bus that lets go.")
+        try:
+            bus: Any = getattr(self.robot, "bus")  # noqa: B009  # not of every robot
+            (bus.enable_torque if on else bus.disable_torque)()
+        except Exception as error:  # drivers raise many kinds
+            raise RobotFault(f"The motors cannot be switched {'on' if on else 'off'}: {error}") from error
+
+    def recover(self) -> None:
+        """After a fault: connect again where the connection is gone, read, hold. Raises RobotFault where it fails."""
+        with self._lock:
+            try:
+                if not self.robot.is_connected:
+                    self.robot.connect()
+            except Exception as error:  # drivers raise many kinds
+                raise RobotFault(f"The robot cannot be connected: {error} Check cables and power.") from error
+            self.read()
+            self._goal = self._measured  # not where it was sent before: it may have been moved
+            self._hold()
+
     def _hold(self) -> None:
         # Where the arm says it is; where it was sent last when that is newer, or the reading cannot be believed.
         place = self._measured if self._trusted and self._read_at >= self._sent_at else self._goal
-        if place is not None:
+        if place is not None and self._goal is not None and not self._released:
             self._held = True
-            self._transmit(np.clip(place, self.limits.low, self.limits.high))
+            # An arm that is beyond a limit stays there: led back at once, it would leap.
+            low, high = np.minimum(self.limits.low, self._goal), np.maximum(self.limits.high, self._goal)
+            self._transmit(np.clip(place, low, high))
 
     def _transmit(self, goal: Array) -> None:
         try:

@@ -74,7 +74,8 @@ def allowed_goal(wanted: Array, measured: Array, last: Array, seconds: float, li
         seconds: since the last goal was sent, > 0.
         limits: what to keep to.
 
-    A goal that is not finite, or whose tip would leave the box, is replaced by the last one: the arm holds.
+    A goal that is not finite, or whose tip would leave the box, is replaced by the last one: the arm holds. Where the
+    last goal was beyond a joint limit, this one is not farther out.
     """
     if not np.isfinite(wanted).all():
         return Verdict(last, ("not finite",))
@@ -82,7 +83,8 @@ def allowed_goal(wanted: Array, measured: Array, last: Array, seconds: float, li
     steps = (
         ("speed", last - limits.max_speed * seconds, last + limits.max_speed * seconds),
         ("step", measured - limits.max_step, measured + limits.max_step),
-        ("joint limit", limits.low, limits.high),  # last, so that it holds whatever the others say
+        # Last, so that it holds whatever the others say. An arm that was outside comes in at its speed, in no leap.
+        ("joint limit", np.minimum(limits.low, last), np.maximum(limits.high, last)),
     )
     for name, low, high in steps:
         bounded = np.clip(goal, low, high)

@@ -57,10 +57,12 @@ class SimUR5eConfig(RobotConfig):
         ramp_s: simulated seconds in which the joints are led to a new goal.
         camera_names: which of left_shoulder, right_shoulder, upper_wrist, lower_wrist.
         image_height, image_width: pixels of each camera, 16 to 1024.
-        state: also give the objects' simulator state, as joints of their own (`object.*`): learns without cameras.
+        state: also give the objects' simulator state, as joints of their own (`object.*.pos`): learns without cameras.
         seed: of the scenes.
         world: name under which a leader in the same process finds this arm.
         faults: what goes wrong, and when.
+        person: address of an operator's page that a simulated person answers at, with the token of CQN_PAGE_TOKEN.
+        person_takes_over_s: simulated seconds of an episode after which this person takes the leader; 0: never.
 
     Raises:
         ConfigError: a value that is not one of those named above.
@@ -76,6 +78,8 @@ class SimUR5eConfig(RobotConfig):
     seed: int = 0
     world: str = "default"
     faults: list[Fault] = field(default_factory=list)
+    person: str = ""
+    person_takes_over_s: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -84,7 +88,10 @@ class SimUR5eConfig(RobotConfig):
         for name in self.camera_names:
             if name not in CAMERAS:
                 raise ConfigError(one_of("camera", name, CAMERAS))
+        if self.person and not self.person.startswith(("http://", "https://")):
+            raise ConfigError(f"person is '{self.person}': expected the page's address, http://127.0.0.1:8765.")
         for name, value, low, high in (
+            ("person_takes_over_s", self.person_takes_over_s, 0.0, 3600.0),
             ("speed", self.speed, 0.01, 100.0),
             ("ramp_s", self.ramp_s, 0.004, 1.0),
             ("image_height", self.image_height, 16, 1024),

@@ -11,7 +11,7 @@ from ..envs.expert import ScriptedTeleoperator
 from ..envs.station import MAX_JOINT_SPEED
 from ..envs.ur5e import HOME, STATE_NAMES
 from .config_sim_leader import SimLeaderConfig
-from .sim_ur5e import to_robot_units
+from .sim_ur5e import from_robot_units, to_robot_units
 from .world import World, find_world
 
 __all__ = ["SimLeader"]
@@ -81,10 +81,16 @@ class SimLeader(Teleoperator):
         return to_robot_units(self._joints, self._closure)
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Lead the leader to these joints, in degrees; it goes on from there."""
-        joints = [feedback[name] for name in STATE_NAMES[:6] if name in feedback]
-        if len(joints) == 6:
-            self._joints = np.radians(np.array(joints, dtype=np.float64))
+        """Lead the leader to these joints, in degrees and 0..100: the person lets it, and does the task from there."""
+        if not all(name in feedback for name in STATE_NAMES):
+            return
+        world = self._world or self._meet()
+        with world.lock:
+            world.catch_up()
+            self._joints, self._closure = from_robot_units(feedback)
+            self._moved, self._since = world.now, world.now
+            if self.phase != "task":
+                self._enter("task", world)
 
     def disconnect(self) -> None:
         """Let go."""

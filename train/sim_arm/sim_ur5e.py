@@ -13,6 +13,7 @@ from lerobot_cqn.errors import ConfigError
 from ..envs.tasks import TASKS
 from ..envs.ur5e import STATE_NAMES
 from .config_sim_ur5e import SimUR5eConfig
+from .person import SimPerson
 from .world import WORLDS, World
 
 __all__ = ["SimUR5e", "from_robot_units", "to_robot_units"]
@@ -43,7 +44,9 @@ class SimUR5e(Robot):
         self.config = config
         self.cameras = dict.fromkeys(config.camera_names)  # lerobot-record counts them
         self._world: World | None = None
+        self._person: SimPerson | None = None
         self._last: dict[str, Any] = {}
+        self._rng = np.random.default_rng(config.seed)
 
     @property
     def world(self) -> World:
@@ -83,6 +86,9 @@ class SimUR5e(Robot):
         if c.world in WORLDS:
             raise ConfigError(f"There is an arm in the world '{c.world}' already: give another --robot.world.")
         self._world = WORLDS[c.world] = World(c.task, c.speed, c.ramp_s, c.seed)
+        if c.person:
+            self._person = SimPerson(self._world, c.person, c.person_takes_over_s)
+            self._person.start()
 
     def calibrate(self) -> None:
         """Nothing to do."""
@@ -125,21 +131,35 @@ class SimUR5e(Robot):
 
     def disconnect(self) -> None:
         """End the world. Raises DeviceNotConnectedError the second time."""
-        self.world.cameras.close()
+        if self._person is not None:
+            self._person.close()
+        self.world.close()
         WORLDS.pop(self.config.world, None)
         self._world = None
 
     def _object_names(self) -> tuple[str, ...]:
-        return tuple(f"object.{name}" for name in TASKS[self.config.task].state_names)
+        # lerobot-rollout hands on what is called a position or a speed, and nothing else.
+        return tuple(f"object.{name}.pos" for name in TASKS[self.config.task].state_names)
 
     def _pictures(self, world: World) -> dict[str, NDArray[np.uint8]]:
         frozen = bool(self._on("frozen_camera"))
         height, width = self.config.image_height, self.config.image_width
         return {
             name: self._last[name] if frozen and name in self._last
-            else world.cameras.picture(world.arm.data, name, height, width)
+            else self._noisy(world.picture(name, height, width))
             for name in self.config.camera_names
         }  # fmt: skip
+
+    def _noisy(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The lowest bit of one value in a hundred is chance, as in real sensors: no two pictures are the same."""
+        values = picture.reshape(-1)
+        values[self._rng.integers(0, len(values), max(8, len(values) // 100))] ^= 1
+        return picture
+
+    def tip_position(self, joints: dict[str, float]) -> NDArray[np.float64]:
+        """Where the tip is at joints in degrees, (3,) m, whatever the arm does now."""
+        angles, _ = from_robot_units(joints)
+        return self.world.tip_at(angles)
 
     def _on(self, kind: str) -> list[Any]:
         return [fault for fault in self.config.faults if fault.kind == kind and fault.active(self.world.now)]

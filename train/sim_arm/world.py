@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import gymnasium as gym
@@ -53,7 +54,8 @@ class World:
     def __init__(self, task: str, speed: float, ramp_s: float, seed: int) -> None:
         self.task = TASKS[task]()
         self.arm = Arm(self.task.mjcf())
-        self.cameras = Cameras(self.arm.model)
+        self._cameras = Cameras(self.arm.model)
+        self._painter = ThreadPoolExecutor(1, "painter")  # a graphics context belongs to one thread; a robot to all
         self.lock = threading.RLock()
         limits = np.array([MAX_JOINT_SPEED / self.fps] * 6 + [1.0], np.float32)
         self.action_space = gym.spaces.Box(np.append(-limits[:6], np.float32(0.0)), limits, dtype=np.float32)
@@ -87,6 +89,20 @@ class World:
     def away(self) -> bool:
         """Whether the arm has left home in this scene."""
         return self._left
+
+    def picture(self, camera: str, height: int, width: int) -> NDArray[np.uint8]:
+        """RGB picture (height, width, 3) of a camera; may be asked for from any thread that has the lock."""
+        return self._painter.submit(self._cameras.picture, self.arm.data, camera, height, width).result()
+
+    def tip_at(self, joints: Array) -> Array:
+        """Where the tip would be, (3,) m, with the arm at joints (6,) rad."""
+        with self.lock:
+            return self.arm.tip_at(joints)
+
+    def close(self) -> None:
+        """Free the graphics."""
+        self._painter.submit(self._cameras.close).result()
+        self._painter.shutdown()
 
     def lay_out(self) -> None:
         """A new scene; the arm stays where it is."""

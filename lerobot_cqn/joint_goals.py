@@ -1,0 +1,219 @@
+"""From a policy's joint differences to an arm's absolute goals and back, in the robot's units.
+
+What a difference is, the dataset's history says: of a goal from the measured joints ("command", and "state", which is
+driven in the same way), or from the goal before ("command_steps"). Two steps do it around the policy, so that every
+command of LeRobot that drives a robot sends goals: one remembers the joints, the other adds the differences to them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import torch
+from lerobot.processor import (
+    AbsoluteActionsProcessorStep,
+    EnvTransition,
+    ProcessorStepRegistry,
+    RelativeActionsProcessorStep,
+    TransitionKey,
+)
+from lerobot.utils.constants import OBS_STATE
+from torch import Tensor
+
+from .errors import DataError, one_of
+from .schema import ACTION, HISTORY, dimension_names, read_history
+
+__all__ = [
+    "DeltaJoints",
+    "DeltaToGoalProcessorStep",
+    "RememberJointsProcessorStep",
+    "action_of",
+    "converted_deltas",
+    "goal_of",
+]
+
+Kind = Literal["command", "command_steps", "state"]
+
+
+@dataclass(frozen=True)
+class DeltaJoints:
+    """Which action dimensions (J,) are differences, and the state dimensions (J,) of the same joints.
+
+    Raises DataError for an unknown kind, or where the two differ in number.
+    """
+
+    kind: Kind
+    action_dims: tuple[int, ...]
+    state_dims: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(Kind):
+            raise DataError(one_of("kind of delta action", str(self.kind), get_args(Kind)))
+        if len(self.action_dims) != len(self.state_dims):
+            raise DataError(
+                f"Delta actions: expected a state for each joint, found {len(self.action_dims)} action and "
+                f"{len(self.state_dims)} state dimensions; write the dataset anew with `cqn-data delta`."
+            )
+
+
+def goal_of(action: Tensor, state: Tensor, last_goal: Tensor, deltas: DeltaJoints | None) -> Tensor:
+    """Absolute goal [..., D] of an action, on its device, in float32 or better.
+
+    Args:
+        action: [..., D], differences in the dimensions that `deltas` names, absolute in the others.
+        state: measured state [..., P], as the dataset orders it.
+        last_goal: goal [..., D] before this one; at the start of an episode the measured joints.
+        deltas: which dimensions are differences, and of what; None: none is.
+    """
+    return _shifted(action, state, last_goal, deltas, 1)
+
+
+def action_of(goal: Tensor, state: Tensor, last_goal: Tensor, deltas: DeltaJoints | None) -> Tensor:
+    """The action [..., D] that asks for a goal [..., D]: how a person's goals become actions; inverse of `goal_of`."""
+    return _shifted(goal, state, last_goal, deltas, -1)
+
+
+def _shifted(value: Tensor, state: Tensor, last_goal: Tensor, deltas: DeltaJoints | None, sign: int) -> Tensor:
+    # In bfloat16 a goal of a hundred degrees would be half a degree off.
+    shifted = value.to(torch.promote_types(value.dtype, torch.float32), copy=True)
+    if deltas is not None:
+        joints = list(deltas.action_dims)
+        base = last_goal[..., joints] if deltas.kind == "command_steps" else state[..., list(deltas.state_dims)]
+        shifted[..., joints] += sign * base.to(shifted)
+    return shifted
+
+
+@ProcessorStepRegistry.register(name="cqn_remember_joints")
+class RememberJointsProcessorStep(RelativeActionsProcessorStep):
+    """Remembers the measured state [K, P] of the newest frame, before it is normalised; changes nothing.
+
+    LeRobot knows the two steps by their base classes and connects them after loading; `enabled` stays False, since
+    actions are differences already when a policy is trained on them.
+
+    Attributes:
+        frames: how many frames have been seen; tells one control step from the next.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(enabled=False)
+        self._last_state: Tensor | None = None
+        self.frames = 0
+
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        """Keep a copy of the state; a frame without one leaves the last."""
+        state = (transition.get(TransitionKey.OBSERVATION) or {}).get(OBS_STATE)
+        if state is not None:
+            self._last_state = torch.as_tensor(state).detach().clone()
+            self.frames += 1
+        return transition
+
+    def reset(self) -> None:
+        """Forget the state: an episode begins."""
+        self._last_state = None
+
+    def get_config(self) -> dict[str, Any]:
+        """Nothing is saved with the checkpoint but that the step is there."""
+        return {}
+
+
+@ProcessorStepRegistry.register(name="cqn_delta_to_goal")
+class DeltaToGoalProcessorStep(AbsoluteActionsProcessorStep):
+    """Turns an action [K, D] into the absolute goal [K, D] by the joints that its partner remembers.
+
+    For kind "command_steps" it remembers the last goal, which starts from the measured joints. A control step begins
+    with a new frame; asking again in the same one gives the same answer.
+
+    Attributes:
+        deltas: which dimensions are differences, and of what.
+    """
+
+    def __init__(
+        self,
+        kind: Kind,
+        action_dims: Sequence[int],
+        state_dims: Sequence[int],
+        relative_step: RelativeActionsProcessorStep | None = None,
+    ) -> None:
+        super().__init__(enabled=True, relative_step=relative_step)
+        self.deltas = DeltaJoints(kind, tuple(action_dims), tuple(state_dims))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last goal: an episode begins."""
+        self._frame = -1
+        self._before: Tensor | None = None  # the goal that this step's is a difference from
+        self._goal: Tensor | None = None  # this step's own
+
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        """Goal of the action. Raises DataError when no state was seen in this episode."""
+        action = transition.get(TransitionKey.ACTION)
+        if not isinstance(action, Tensor):
+            return transition
+        state, before = self._remembered(action)
+        self._goal = goal_of(action, state, before, self.deltas)
+        changed = transition.copy()
+        changed[TransitionKey.ACTION] = self._goal.clone()
+        return changed
+
+    def sent(self, goal: Tensor | None) -> None:
+        """Which goal [K, D] was really sent in this step; None: none was, and the next starts from the joints."""
+        self._goal = None if goal is None else goal.detach().clone()
+
+    def action_of(self, goal: Tensor) -> Tensor:
+        """The action [K, D] that would have asked for a goal [K, D] in this step, before or after it was sent.
+
+        Raises DataError when no state was seen in this episode.
+        """
+        state, before = self._remembered(goal)
+        return action_of(goal, state, before, self.deltas)
+
+    def get_config(self) -> dict[str, Any]:
+        """What is saved with the checkpoint."""
+        d = self.deltas
+        return {"kind": d.kind, "action_dims": list(d.action_dims), "state_dims": list(d.state_dims)}
+
+    def _remembered(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """State [K, P] of this step, and the goal [K, D] before it."""
+        partner = self.relative_step
+        state = partner.get_cached_state() if isinstance(partner, RememberJointsProcessorStep) else None
+        if not isinstance(partner, RememberJointsProcessorStep) or state is None:
+            raise DataError(
+                f"The policy's actions are joint differences, and no joints were seen yet: expected '{OBS_STATE}' in "
+                "the observation before the first action, found none; run the preprocessor on one that has it."
+            )
+        if partner.frames != self._frame:
+            self._frame, self._before = partner.frames, self._goal
+        if self._before is None:
+            self._before = torch.zeros_like(like, dtype=state.dtype, device=state.device)
+            self._before[..., list(self.deltas.action_dims)] = state[..., list(self.deltas.state_dims)]
+        return state, self._before
+
+
+def converted_deltas(dataset_meta: Any) -> DeltaJoints | None:
+    """What `cqn-data delta` made of a dataset's absolute actions; None where the robot takes actions as they are.
+
+    dataset_meta: LeRobot's metadata (its folder `root`, and `features`); None: no dataset.
+    Raises DataError for a damaged history, or one that names dimensions which the features do not have.
+    """
+    if dataset_meta is None:
+        return None
+    root = Path(dataset_meta.root)
+    entries = [entry for entry in read_history(root) if "deltas" in entry]
+    # Differences that were recorded are what the environment itself takes.
+    recorded = [entry["deltas"] for entry in entries if entry.get("operation") == "record"]
+    now = entries[-1]["deltas"] if entries else None
+    if not now or now in recorded:
+        return None
+    try:
+        actions, states = (dimension_names(dataset_meta.features[key]) for key in (ACTION, OBS_STATE))
+        return DeltaJoints(
+            now["kind"],
+            tuple(actions.index(name) for name in now["action"]),
+            tuple(states.index(name) for name in now["state"]),
+        )
+    except (KeyError, ValueError, TypeError) as error:
+        raise DataError(
+            f"{root / HISTORY} does not fit the features ({error!r}): expected names of action and state dimensions; "
+            "write the dataset anew with `cqn-data delta`."
+        ) from error

@@ -1,0 +1,96 @@
+"""The operator's page under anything at all: nothing breaks, and nothing changes without the token."""
+
+import json
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from cqn_train.operator_page.board import Board
+from cqn_train.operator_page.session import BY_ITSELF, TRANSITIONS, Event, State
+
+pytest.importorskip("fastapi", reason="needs the extra [page]")
+
+from fastapi.testclient import TestClient
+
+from .operator_clients import TOKEN, board_fixture, client_fixture, clock_fixture  # noqa: F401  # fixtures
+
+words = st.sampled_from(
+    ["event", "start", "stop", "pause", "success", "fault", "absent", "label", "episode", "id", "client", "token", "x"]
+)
+values = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(allow_nan=True), words, st.text(max_size=5)),
+    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(words, inner, max_size=3)),
+    max_leaves=5,
+)
+events = st.builds(lambda e: {"event": e}, st.sampled_from([str(event) for event in Event]))
+labels = st.builds(
+    lambda n, w: {"episode": n, "label": w}, st.integers(-2, 3), st.sampled_from(["success", "failure", "x"])
+)
+bodies = st.one_of(
+    st.binary(max_size=20), st.one_of(values, events, labels).map(lambda value: json.dumps(value).encode())
+)
+pieces = st.sampled_from(
+    ["api", "state", "event", "relabel", "control", "camera", "film", "front", "front.jpg", "0", "-1", "9" * 30, "..",
+     "%2e%2e", "%00", "ws", "page.js", "a b", "ä", "", "{name}"]
+)  # fmt: skip
+routes = st.one_of(
+    st.sampled_from(["/api/state", "/api/event", "/api/relabel", "/api/control", "/api/film/0/front", "/"]),
+    st.lists(pieces, max_size=4).map(lambda parts: "/" + "/".join(parts)),
+)
+queries = st.dictionaries(
+    st.sampled_from(["token", "client", "frame", "x"]),
+    st.one_of(words, st.text(max_size=5), st.integers().map(str)), max_size=3,
+)  # fmt: skip
+methods = st.sampled_from(["GET", "POST", "POST", "POST", "PUT", "DELETE", "HEAD", "OPTIONS", "PATCH"])
+names = st.sampled_from(["X-Client", "Origin", "Content-Type", "Accept", "X-Forwarded-Host", "X-Token", "Range"])
+extra = st.dictionaries(names, st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=8), max_size=3)
+FUZZ = settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@FUZZ
+@given(methods, routes, queries, extra, bodies)
+def test_without_the_token_nothing_changes_whatever_is_sent(
+    client: TestClient, board: Board, method: str, path: str, query: dict, headers: dict, body: bytes
+) -> None:
+    if method == "GET" and path in client.app.state.public:
+        return
+    before = (board.session.snapshot(), client.app.state.control.snapshot(None))
+    answer = client.request(method, path, params=query, headers=headers, content=body)
+    assert answer.status_code in (401, 403)
+    assert (board.session.snapshot(), client.app.state.control.snapshot(None)) == before
+
+
+@FUZZ
+@given(st.sampled_from(State), methods, routes, queries, extra, bodies, st.sampled_from([None, "ann", "bob"]))
+def test_with_the_token_only_what_the_state_machine_allows(
+    client: TestClient, board: Board, state: State, method: str, path: str, query: dict, headers: dict, body: bytes,
+    who: str | None,
+) -> None:  # fmt: skip
+    session = board.session
+    session.state, session.episode, session.labels, session.busy = state, 0, {0: "success"}, ""
+    client.app.state.control.take("ann")
+    query = {name: value for name, value in query.items() if name != "token"} | ({"client": who} if who else {})
+    headers = {name: value for name, value in headers.items() if name != "Origin"} | {"X-Token": TOKEN}
+    answer = client.request(method, path, params=query, headers=headers, content=body)
+    assert answer.status_code < 500
+    if session.state is not state:
+        allowed = {target for event, target in TRANSITIONS[state].items() if event not in BY_ITSELF}
+        assert session.state in allowed
+        assert (method, path) == ("POST", "/api/event")
+        assert session.state is State.STOPPED or query.get("client", headers.get("X-Client")) == "ann"
+
+
+@FUZZ
+@given(st.lists(st.one_of(st.text(max_size=20), st.one_of(values, events).map(json.dumps)), max_size=6))
+def test_whatever_comes_over_the_websocket_is_answered(client: TestClient, board: Board, texts: list[str]) -> None:
+    board.session.state, board.session.busy = State.WAITING, ""
+    client.app.state.control.take("ann")
+    with client.websocket_connect(f"ws://127.0.0.1/ws?token={TOKEN}&client=ann") as page:
+        for text in texts:
+            page.send_text(text)
+        page.send_bytes(b"\x00\x01")
+        page.send_json({"event": "stop", "id": 77})
+        while (message := page.receive_json()).get("answer") != 77:
+            assert "snapshot" in message or isinstance(message["ok"], bool)
+        assert message["ok"]

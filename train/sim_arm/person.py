@@ -1,0 +1,89 @@
+"""A simulated person who looks at the arm and answers at the operator's page, through the page's own interface."""
+
+import json
+import os
+import threading
+import time
+import urllib.error
+import urllib.request
+from typing import Any
+
+from .world import World
+
+__all__ = ["TOKEN", "SimPerson"]
+
+TOKEN = "CQN_PAGE_TOKEN"  # noqa: S105  # the variable's name
+LOOK_S = 0.03
+SURE_S = 0.2  # simulated seconds for which the task must look done
+
+
+class SimPerson:
+    """Starts episodes, says how they went, waits for the scene; takes the leader when a try takes too long.
+
+    What it knows is what a person sees: whether the task is done and whether the arm is home.
+    """
+
+    def __init__(self, world: World, url: str, takes_over_s: float = 0.0) -> None:
+        """Watch a world and answer at `url` (http://host:port), with the token of CQN_PAGE_TOKEN.
+
+        takes_over_s: simulated seconds of an episode after which it takes the leader, until the task is done; 0: never.
+        """
+        self.world, self.url, self.takes_over_s = world, url.rstrip("/"), takes_over_s
+        self._closing = threading.Event()
+        self._state, self._since, self._done_at = "", 0.0, -1.0
+        self._thread = threading.Thread(target=self._run, name="simulated-person", daemon=True)
+
+    def start(self) -> None:
+        """Begin to watch."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Go away; does not wait, since an answer may be under way."""
+        self._closing.set()
+
+    def _run(self) -> None:
+        while not self._closing.wait(LOOK_S):
+            try:
+                self._look()
+            except (OSError, ValueError, KeyError):  # no page yet, or no more: look again
+                time.sleep(0.2)
+
+    def _look(self) -> None:
+        session = self._ask("/api/state")["session"]
+        world, state = self.world, str(session["state"])
+        if state != self._state:
+            self._state, self._since = state, world.now
+        if not world.success:
+            self._done_at = -1.0
+        elif self._done_at < 0:
+            self._done_at = world.now
+        done = self._done_at >= 0 and world.now - self._done_at >= SURE_S
+        event = self._answer(state, done, world.now - self._since)
+        if event and event in session["allowed"]:
+            self._ask("/api/event", {"event": event})
+
+    def _answer(self, state: str, done: bool, seconds: float) -> str:
+        if state in ("running", "teaching") and done:
+            return "success"
+        if state == "running" and 0 < self.takes_over_s < seconds:
+            return "take_over"
+        if state == "labelling":
+            return "success" if self.world.success else "failure"
+        if state == "resetting" and not self.world.away:
+            return "ready"
+        if state == "waiting" and not self.world.away:
+            return "start"
+        return "resume" if state == "paused" and seconds > 1.0 else ""
+
+    def _ask(self, path: str, body: dict[str, Any] | None = None) -> dict[str, Any]:
+        request = urllib.request.Request(  # noqa: S310  # an address that the user gave
+            f"{self.url}{path}?client=simulated-person",
+            data=None if body is None else json.dumps(body).encode(),
+            headers={"X-Token": os.environ.get(TOKEN, ""), "Content-Type": "application/json"},
+        )
+        try:
+            with urllib.request.urlopen(request, timeout=2) as answer:  # noqa: S310
+                said: dict[str, Any] = json.load(answer)
+        except urllib.error.HTTPError as error:  # refused: things have changed meanwhile, look again
+            raise OSError(f"{path}: {error}") from error
+        return said
