@@ -2,8 +2,10 @@
 
 import contextlib
 import os
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,8 +30,9 @@ from .robot.arm import Arm
 from .robot.guard import Guard, GuardSettings
 from .robot.limits import Forward, Limits
 from .robot.settings import ArmSettings
+from .stages import read_rows
 
-__all__ = ["TOKEN", "Operated", "make_operated", "steering"]
+__all__ = ["TOKEN", "Operated", "make_operated", "recall", "steering"]
 
 Array = NDArray[np.float64]
 TOKEN = "CQN_PAGE_TOKEN"  # noqa: S105  # the variable's name: a token in an option would be saved with the run
@@ -83,8 +86,10 @@ def make_operated(
 
 @contextlib.contextmanager
 def steering(config: RunConfig, operated: Operated, say: Callable[[str], None]) -> Any:
-    """The operator's page, or keys in the terminal, for as long as the block runs."""
+    """The operator's page, or keys in the terminal, while the block runs. Raises ConfigError without either."""
     if not config.operator_page:
+        if not sys.stdin.isatty():
+            raise ConfigError("There is no terminal whose keys could steer the arm: leave out --operator_page=false.")
         from .operator_page.terminal import TerminalKeys
 
         with TerminalKeys(operated.session):
@@ -98,6 +103,14 @@ def steering(config: RunConfig, operated: Operated, say: Callable[[str], None]) 
     ) as server:  # fmt: skip
         say(f"Operator's page: {server.url}")
         yield
+
+
+def recall(board: Board, output_dir: Path) -> None:
+    """Show what a resumed run did before: the rows of its tables."""
+    for table in ("episodes", "evaluations"):
+        for row in read_rows(output_dir / f"{table}.csv"):
+            numbers = {f"{table}/{name}": text for name, text in row.items() if text and name != "phase"}
+            board.log({name: float(text) for name, text in numbers.items()})
 
 
 def check_robot_fits(robot: Robot, agent: Agent) -> None:

@@ -34,7 +34,7 @@ from lerobot_cqn.learner import Learner
 from . import envs  # noqa: F401  # registers our environments
 from .agent import Agent
 from .arguments import introduction, parse
-from .arm_parts import Operated, make_operated, steering
+from .arm_parts import Operated, make_operated, recall, steering
 from .checkpoint import Counters, last_checkpoint, restore, save, seed_everything
 from .config import RunConfig
 from .console import ConsoleMonitor, Monitors
@@ -70,6 +70,8 @@ def build(
     agent = make_agent(config, checkpoint, gym)
     operated = make_operated(config, agent, should_stop, monitor.message) if gym is None else None
     env, scenes = make_scenes(config, agent, gym, operated)
+    if operated is not None:  # before anything is written: the port may be taken
+        stack.enter_context(steering(config, operated, monitor.message))
     stack.callback(env.close)
     stack.callback(scenes.close)
     s = config.policy.settings
@@ -111,7 +113,7 @@ def build(
     shown: Monitor = monitor
     if operated is not None:
         stack.callback(lambda: monitor.message(operated.env.summary()) if operated.env.summary() else None)
-        stack.enter_context(steering(config, operated, monitor.message))
+        recall(operated.board, config.output_dir)
         shown = Monitors([monitor, operated.board])
     return Trainer(
         config, agent, learner, env, scenes, replay, metrics, shown, rng, counters, save_checkpoint, should_stop,

@@ -130,6 +130,7 @@ def test_online_with_a_person_killed_and_resumed(
     (["--robot.type=sim_ur5e", *CAMERA, "--robot.state=true", "--arm.joint_limits={elbo.pos: [0, 1]}"], "elbow.pos"),
     (["--robot.type=sim_ur5e", *CAMERA, "--robot.state=true", "--arm.workspace=[1, 0, 0, 1, 0, 1]"], "low < high"),
     (["--teleop.type=sim_leader", "--env.type=ur5e_station"], "leader of an arm"),
+    (["--robot.type=sim_ur5e", *CAMERA, "--robot.state=true", "--operator_page=false"], "There is no terminal"),
 ])  # fmt: skip
 def test_mistakes_are_said_before_anything_moves(
     options: list[str], said: str, demonstrations: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -138,4 +139,22 @@ def test_mistakes_are_said_before_anything_moves(
     assert main([*TINY_POLICY, *SMALL_EYES, *data, *options, f"--output_dir={tmp_path / 'run'}"]) == 2
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert said in error
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_port_in_use_is_said_before_anything_is_written(
+    demonstrations: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        options = [
+            *TINY_POLICY, *SMALL_EYES, *CAMERA, "--dataset.repo_id=local/cqn", f"--dataset.root={demonstrations}",
+            "--robot.type=sim_ur5e", "--robot.state=true", f"--page.port={port}",
+            f"--output_dir={tmp_path / 'run'}",
+        ]  # fmt: skip
+        assert main(options) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert f"127.0.0.1:{port}" in error
     assert not (tmp_path / "run").exists()

@@ -142,7 +142,9 @@ def test_a_pause_holds_the_arm_and_counts_for_nothing(arm: Bench) -> None:
         time.sleep(0.5 / FPS)
         arm.do(Event.PAUSE)
         began, sent = time.monotonic(), len(arm.goals)
-        held["rests"] = (time.sleep(0.1), arm.at_rest())[1]  # a tenth of a second is enough to stand still
+        time.sleep(0.1)  # enough to stand still, and less than the watchdog's time
+        held["soon"] = len(arm.goals) - sent
+        held["rests"] = arm.at_rest()
         held["joints"], held["goals"] = arm.joints, arm.goals[sent:]
         arm.do(Event.RESUME)
         held["seconds"] = time.monotonic() - began
@@ -150,6 +152,7 @@ def test_a_pause_holds_the_arm_and_counts_for_nothing(arm: Bench) -> None:
     arm.meanwhile(pause)
     outcome = arm.step(20)
     assert held["rests"]
+    assert held["soon"] == 1
     assert np.abs(held["joints"] - before).max() <= 2 * STEP_DEG  # the step that was under way, and its hold
     assert len(held["goals"]) == 1  # the hold, and nothing else
     assert outcome.skipped
