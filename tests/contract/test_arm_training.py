@@ -12,6 +12,7 @@ import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from cqn_train import cli
 from cqn_train.arguments import parse
 from cqn_train.arm_env import ArmEnvironment
 from cqn_train.cli import build
@@ -60,6 +61,12 @@ ARM = [
     "--batch_size=4", "--demo_batch_size=4", "--updates_per_episode=2", "--log_freq=1", "--save_freq=100000",
     "--arm.home_speed=1",
 ]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _no_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread steers the session itself; keys would need a terminal."""
+    monkeypatch.setattr(cli, "steering", lambda *_: contextlib.nullcontext())
 
 
 class Hands:
