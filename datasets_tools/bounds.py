@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_cqn.schema import dimension_names
+
 from .console import note, table
 from .job import Step, help_for, main_for, settings_of
 from .options import option
-from .view import Bounds, View, dimension_names
+from .view import Bounds, View
 
 __all__ = ["SetBounds", "help", "main", "quantile_bounds"]
 

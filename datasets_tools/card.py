@@ -13,13 +13,12 @@ import yaml
 from numpy.typing import NDArray
 
 from lerobot_cqn.errors import DataError
-from lerobot_cqn.schema import NEXT_REWARD, NEXT_SUCCESS
+from lerobot_cqn.schema import NEXT_REWARD, NEXT_SUCCESS, dimension_names
 
 from .deltas import ACTION
 from .resize import picture_size
 from .source import Source
 from .story import code, plain, tell
-from .view import dimension_names
 
 __all__ = ["END", "START", "Facts", "Labels", "look", "own_text", "write_card"]
 

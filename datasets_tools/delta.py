@@ -89,10 +89,11 @@ of the next step minus this one (the way back gives where the arm went, not what
         import numpy as np
 
         from lerobot_cqn.errors import ConfigError, DataError, one_of
+        from lerobot_cqn.schema import dimension_names
 
         from .deltas import ACTION, STATE, Deltas, Kind
         from .readable import match_joints
-        from .view import dimension_names, gripper_dims
+        from .view import gripper_dims
 
         if view.deltas is not None:
             raise ConfigError(f"The actions are deltas already (kind {view.deltas.kind}); nothing to do.")
@@ -127,8 +128,9 @@ def _show(view: "View") -> None:
     """Range of every dimension after the operation."""
     import numpy as np
 
+    from lerobot_cqn.schema import dimension_names
+
     from .deltas import ACTION
-    from .view import dimension_names
 
     def actions(episode: "Episode") -> Any:
         return np.asarray(episode.columns[ACTION], np.float64)

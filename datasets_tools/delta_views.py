@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_cqn.schema import dimension_names
+
 from .deltas import ACTION, STATE, Deltas, absolute_action, delta_action
-from .view import Bounds, Episode, View, dimension_names
+from .view import Bounds, Episode, View
 
 __all__ = ["AbsoluteView", "DeltaView", "described"]
 

@@ -115,10 +115,11 @@ Delta actions are formed anew, so that they connect the states that are left.
     def rule(self, view: "View") -> "tuple[Rule, dict[str, Any]]":
         """What a pause is in this dataset, and how an automatic threshold was decided."""
         from lerobot_cqn.errors import ConfigError, DataError, one_of
+        from lerobot_cqn.schema import dimension_names
 
         from .deltas import ACTION, STATE
         from .pauses import Rule
-        from .view import dimension_names, gripper_dims
+        from .view import gripper_dims
 
         for key in (STATE, ACTION):
             if key not in view.features:

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_cqn.errors import ConfigError
+from lerobot_cqn.schema import dimension_names
 
 from .deltas import STATE
 from .pauses import Rule
-from .view import Camera, Episode, View, dimension_names
+from .view import Camera, Episode, View
 
 __all__ = ["write_preview"]
 

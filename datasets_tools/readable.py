@@ -5,12 +5,13 @@ from dataclasses import dataclass, field
 from typing import cast
 
 from lerobot_cqn.errors import DataError
+from lerobot_cqn.schema import dimension_names
 
 from .console import note
 from .deltas import ACTION, STATE, Deltas, Kind
 from .job import Job
 from .source import Source
-from .view import View, dimension_names, gripper_dims
+from .view import View, gripper_dims
 
 __all__ = ["match_joints", "readable"]
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from lerobot_cqn.errors import ConfigError, one_of
-from lerobot_cqn.schema import NEXT_REWARD, NEXT_SUCCESS
+from lerobot_cqn.schema import NEXT_REWARD, NEXT_SUCCESS, dimension_names
 
-from .view import Episode, View, dimension_names
+from .view import Episode, View
 
 __all__ = ["Rule", "parse_rule"]
 

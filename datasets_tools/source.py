@@ -14,11 +14,12 @@ from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
 from numpy.typing import NDArray
 
 from lerobot_cqn.errors import DataError
+from lerobot_cqn.schema import dimension_names
 
 from .deltas import KINDS, Deltas
 from .pictures import shaped, video_pictures
 from .target import read_history
-from .view import Bounds, Camera, Episode, View, dimension_names
+from .view import Bounds, Camera, Episode, View
 
 __all__ = ["Source", "local_root", "open_source"]
 

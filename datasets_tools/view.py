@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from .deltas import Deltas
     from .source import Source
 
-__all__ = ["SOURCE_EPISODE", "SOURCE_FRAME", "Bounds", "Camera", "Episode", "View", "dimension_names", "gripper_dims"]
+__all__ = ["SOURCE_EPISODE", "SOURCE_FRAME", "Bounds", "Camera", "Episode", "View", "gripper_dims"]
 
 SOURCE_EPISODE, SOURCE_FRAME = "source.episode_index", "source.frame_index"
 
@@ -129,20 +129,6 @@ class View:
     def history(self) -> list[dict[str, Any]]:
         """Entries of all operations since the source, first one first."""
         return [*self.parent.history(), *([self.entry] if self.entry else [])]
-
-
-def dimension_names(feature: Mapping[str, Any]) -> list[str]:
-    """Names of a vector's dimensions, whichever way the recorder nested them; numbers where there are none."""
-
-    def flat(names: Any) -> list[str]:
-        if isinstance(names, str):
-            return [names]
-        inner = names.values() if isinstance(names, Mapping) else names if isinstance(names, Sequence) else ()
-        return [name for value in inner for name in flat(value)]
-
-    size = int(np.prod(feature["shape"]))
-    names = flat(feature.get("names") or ())
-    return names if len(names) == size else [str(i) for i in range(size)]
 
 
 def gripper_dims(names: Sequence[str], chosen: Sequence[str] = ()) -> tuple[int, ...]:

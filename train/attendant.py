@@ -103,12 +103,16 @@ class Attendant:
 
     def _bring_home(self) -> None:
         """Steps towards home at the control rate, until it is there or something else comes up."""
-        while self._homeward and not self._closing.is_set() and not self.session.free:
-            self._show(self.arm.guard.read().pictures)
-            self._homeward = not self.arm.step_home(lambda: self.session.state in BETWEEN)
-            time.sleep(1 / self.arm.fps)
-        self._homeward = False
-        self.arm.guard.hold()
+        self.session.note_homing(True)
+        try:
+            while self._homeward and not self._closing.is_set() and not self.session.free:
+                self._show(self.arm.guard.read().pictures)
+                self._homeward = not self.arm.step_home(lambda: self.session.state in BETWEEN)
+                time.sleep(1 / self.arm.fps)
+            self._homeward = False
+            self.arm.guard.hold()
+        finally:
+            self.session.note_homing(False)
 
     def _recover(self) -> None:
         try:

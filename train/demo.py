@@ -4,7 +4,6 @@ Runs the same commands a user would type, two trainings at a time on one thread 
 Interrupted at any moment, it continues where it was when started again.
 """
 
-import json
 import subprocess
 import sys
 import time
@@ -12,14 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import draccus
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from lerobot_cqn.errors import CQNError
-
-from .stages import Stages, fresh, read_rows
+from .stages import Stages, fresh, read_rows, run_once
 
 __all__ = ["DemoConfig", "main", "run_demo"]
 
@@ -157,24 +153,8 @@ def _interval(result: dict[str, Any]) -> str:
 
 def main() -> int:
     """Entry of `python -m cqn_train.demo`."""
-    console = Console(highlight=False)
-    try:
-        config = draccus.parse(DemoConfig)
-        finished = config.output_dir / "summary.json"
-        if finished.exists():
-            console.print(f"Already done; delete {config.output_dir} to run it again.")
-            summary = json.loads(finished.read_text())
-        else:
-            console.print("CQN on paused demonstrations, with and without the pause filter: 6-9 minutes")
-            summary = run_demo(config, console)
-        show(summary, config, console)
-    except KeyboardInterrupt:
-        console.print("Stopped; start it again to continue.")
-        return 130
-    except CQNError as error:
-        console.print(f"demo: {error}", style="red")
-        return 2
-    return 0
+    introduction = "CQN on paused demonstrations, with and without the pause filter: 6-9 minutes"
+    return run_once("demo", DemoConfig, introduction, run_demo, show)
 
 
 if __name__ == "__main__":

@@ -13,15 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import draccus
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from lerobot_cqn.errors import CQNError
-
 from .arm_parts import TOKEN
-from .stages import Stages, fresh, read_rows
+from .stages import Stages, fresh, read_rows, run_once
 
 __all__ = ["ArmDemoConfig", "main", "run_demo"]
 
@@ -163,24 +160,8 @@ def show(summary: dict[str, Any], config: ArmDemoConfig, console: Console) -> No
 
 def main() -> int:
     """Entry of `python -m cqn_train.demo_arm`."""
-    console = Console(highlight=False)
-    try:
-        config = draccus.parse(ArmDemoConfig)
-        finished = config.output_dir / "summary.json"
-        if finished.exists():
-            console.print(f"Already done; delete {config.output_dir} to run it again.")
-            summary = json.loads(finished.read_text())
-        else:
-            console.print("CQN on a simulated arm with a simulated person at the operator's page: about 10 minutes")
-            summary = run_demo(config, console)
-        show(summary, config, console)
-    except KeyboardInterrupt:
-        console.print("Stopped; start it again to continue.")
-        return 130
-    except CQNError as error:
-        console.print(f"demo-arm: {error}", style="red")
-        return 2
-    return 0
+    introduction = "CQN on a simulated arm with a simulated person at the operator's page: about 8 minutes"
+    return run_once("demo-arm", ArmDemoConfig, introduction, run_demo, show)
 
 
 if __name__ == "__main__":

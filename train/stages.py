@@ -1,19 +1,22 @@
 """Commands one after the other, each with its output in a log; what is done is not done again."""
 
 import csv
+import json
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import draccus
 from rich.console import Console
 
 from lerobot_cqn.errors import CQNError
 
-__all__ = ["DemoError", "Stages", "fresh", "read_rows"]
+__all__ = ["DemoError", "Stages", "fresh", "read_rows", "run_once"]
 
 
 class DemoError(CQNError):
@@ -93,3 +96,34 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         return []
     with path.open() as file:
         return list(csv.DictReader(file))
+
+
+def run_once(
+    name: str,
+    kind: type,
+    introduction: str,
+    run: Callable[[Any, Console], dict[str, Any]],
+    show: Callable[[dict[str, Any], Any, Console], None],
+) -> int:
+    """A demo as a command, with settings `kind` from the command line; what it has finished is only shown again.
+
+    Returns 0, 2 for an error of the user's or of a command, 130 after an interrupt.
+    """
+    console = Console(highlight=False)
+    try:
+        config: Any = draccus.parse(kind)
+        finished = config.output_dir / "summary.json"
+        if finished.exists():
+            console.print(f"Already done; delete {config.output_dir} to run it again.")
+            summary = json.loads(finished.read_text())
+        else:
+            console.print(introduction, soft_wrap=True)
+            summary = run(config, console)
+        show(summary, config, console)
+    except KeyboardInterrupt:
+        console.print("Stopped; start it again to continue.")
+        return 130
+    except CQNError as error:
+        console.print(f"{name}: {error}", style="red")
+        return 2
+    return 0

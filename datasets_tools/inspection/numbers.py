@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_cqn.errors import DataError
-from lerobot_cqn.schema import ACTION, NEXT_REWARD, NEXT_SUCCESS
+from lerobot_cqn.schema import ACTION, NEXT_REWARD, NEXT_SUCCESS, dimension_names
 
 from ..pauses import pause_runs
 from ..source import Source
 from ..threshold import Motion, Suggestion
-from ..view import Episode, dimension_names, gripper_dims
+from ..view import Episode, gripper_dims
 from .follow import Follow
 
 __all__ = ["DRAWN", "Dimension", "EpisodeNumbers", "Jump", "Numbers", "measure"]

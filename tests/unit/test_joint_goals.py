@@ -17,7 +17,6 @@ from lerobot.processor import NormalizerProcessorStep
 from lerobot.processor.relative_action_processor import RelativeActionsProcessorStep
 
 from cqn_data.deltas import KINDS, to_absolute, to_delta
-from cqn_data.view import dimension_names as names_in_the_tools
 from lerobot_cqn.configuration_cqn import CQNConfig
 from lerobot_cqn.configuration_drqv2 import DrQv2Config
 from lerobot_cqn.errors import DataError
@@ -30,7 +29,7 @@ from lerobot_cqn.joint_goals import (
     converted_deltas,
     goal_of,
 )
-from lerobot_cqn.schema import HISTORY, dimension_names
+from lerobot_cqn.schema import HISTORY
 
 D, J, P, T = 4, 3, 5, 12
 ACTION_DIMS, STATE_DIMS = (0, 1, 3), (0, 2, 4)  # the gripper in between stays absolute
@@ -173,14 +172,6 @@ def test_a_history_that_does_not_fit_is_one_line(damage: dict[str, Any], tmp_pat
     (tmp_path / HISTORY).write_text("{}")
     with pytest.raises(DataError, match="is damaged"):
         converted_deltas(meta)
-
-
-@pytest.mark.parametrize(
-    "names", [None, ["a", "b"], {"motors": ["a", "b"]}, {"x": 0, "y": 1}, ["a"], {"m": [["a"], "b"]}]
-)
-def test_names_are_read_as_the_tools_read_them(names: Any) -> None:
-    feature = {"shape": (2,), "names": names}
-    assert dimension_names(feature) == names_in_the_tools(feature)
 
 
 def config(policy: type[Any] = CQNConfig) -> Any:

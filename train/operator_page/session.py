@@ -98,6 +98,7 @@ class Session:
         fault: what the robot said last, "" while all is well.
         busy: what the learner is at, "" while it is ready; no episode starts meanwhile. The end of an episode sets it.
         breaks: how often an episode was paused or broken off by a fault, in all.
+        homing: whether the arm is on its way home.
         leader: whether there is a leader arm to take over with; can_free: whether the arm can be moved by hand.
         free: whether it is to be moved by hand now; every event but READY ends that.
         on_change: called after each change, with the lock held: must be quick and must not raise.
@@ -110,6 +111,7 @@ class Session:
     fault: str = ""
     busy: str = ""
     breaks: int = 0
+    homing: bool = False
     leader: bool = True
     can_free: bool = True
     free: bool = False
@@ -198,6 +200,12 @@ class Session:
             self.busy = doing
             self.on_change(self)
 
+    def note_homing(self, on: bool) -> None:
+        """Say whether the arm is on its way home, for those who stand beside it."""
+        with self._lock:
+            self.homing = on
+            self.on_change(self)
+
     def take_home(self) -> bool:
         """Whether the arm is to go home, for whoever moves it; asked once."""
         with self._lock:
@@ -221,7 +229,7 @@ class Session:
         with self._lock:
             return {
                 "state": str(self.state), "episode": self.episode, "fault": self.fault, "busy": self.busy,
-                "evaluating": self.evaluating, "free": self.free,
+                "evaluating": self.evaluating, "free": self.free, "homing": self.homing,
                 "allowed": [str(event) for event in self.allowed()],
                 "labels": {str(number): str(label) for number, label in self.labels.items()},
             }  # fmt: skip

@@ -145,6 +145,7 @@ function show(snapshot) {
   const name = session.evaluating && !["faulted", "stopped"].includes(session.state) ? `${word} · evaluation` : word;
   say($("state-name"), name);
   say($("state-hint"), session.state === "faulted" && session.fault ? `${session.fault} ${hint}`
+    : session.homing ? `The arm goes home: keep clear. ${hint}`
     : session.free ? "The arm can be moved by hand: hold it. By hand (M) again, or any other step, makes it hold itself."
     : session.state === "waiting" && session.busy ? "The learner is at work: the next episode can start when it is done." : hint);
   document.title = `${name} · operator`;
