@@ -74,6 +74,11 @@ def make_operated(
     settings = GuardSettings(config.arm.stale_s, config.arm.watchdog_s)
     clutched = [i for i, name in enumerate(names) if "gripper" not in name]
     arm = Arm(Guard(robot, limits, settings), config.arm, fps, leader=leader, clutched=clutched, home=home)
+    if agent.deltas is None:
+        say(
+            "Warning: the policy's actions are absolute goals, which may lie far from the arm; on real arms learn "
+            "differences (cqn-data delta, or the recipe paper_real_world)."
+        )
     session = Session(leader=leader is not None, can_free=arm.guard.can_release)
     board = Board(session)
     if config.arm.on_exit == "hold" and getattr(config.robot, "disable_torque_on_disconnect", False):
@@ -206,7 +211,7 @@ def _made(kind: str, make: Callable[[Any], Any], config: Any) -> Any:
     try:
         return make(config)
     except Exception as error:  # drivers raise many kinds, and miss packages
-        raise ConfigError(f"--{kind}.type={config.type} cannot be made: {error}") from error
+        raise ConfigError(f"The device of --{kind}.type cannot be made: {error}") from error
 
 
 def _check_names(robot: Robot, features: dict[str, Any]) -> None:

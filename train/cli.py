@@ -39,6 +39,7 @@ from .checkpoint import Counters, last_checkpoint, restore, save, seed_everythin
 from .config import RunConfig
 from .console import ConsoleMonitor, Monitors
 from .demonstrations import load_episodes, load_metadata
+from .devices import register_devices
 from .gym_env import GymEnvironment, GymScenes, OneScene
 from .interfaces import Environment, Interrupted, Scenes
 from .look import draw_batch, warnings_about
@@ -277,6 +278,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     set_up_logging(debug)
     register_third_party_plugins()
     if not arguments or "-h" in arguments or "--help" in arguments:
+        register_devices()
         print(introduction())  # noqa: T201
         parser.print_scoped_help(RunConfig, arguments)
         return 0

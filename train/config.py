@@ -142,11 +142,6 @@ class RunConfig:
             )
         if self.output_dir is None:
             raise ConfigError("No output directory: give --output_dir=DIR.")
-        if (self.env is None) == (self.robot is None):
-            raise ConfigError(
-                "Expected either an environment or an arm: give --env.type=..., for example --env.type=ur5e_station, "
-                "or --robot.type=... (lerobot-train needs none)."
-            )
         self._validate_arm()
         recipe = self.recipe
         learns_from_data = recipe.demo_batch_size > 0 or self.offline_updates > 0
@@ -170,6 +165,15 @@ class RunConfig:
             raise ConfigError(one_of("action_bounds", recipe.action_bounds, valid))
 
     def _validate_arm(self) -> None:
+        if self.env is not None and self.robot is not None:
+            raise ConfigError(
+                "Expected either an environment or an arm, got both: leave out --env.type or --robot.type."
+            )
+        if self.env is None and self.robot is None:
+            raise ConfigError(
+                "No environment and no arm: give --env.type=..., for example --env.type=ur5e_station, or "
+                "--robot.type=... (lerobot-train needs none)."
+            )
         if self.online_minutes is not None and not self.online_minutes > 0:
             raise ConfigError(f"`online_minutes` must be positive, got {self.online_minutes}.")
         if self.robot is None:

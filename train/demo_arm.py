@@ -33,8 +33,8 @@ class ArmDemoConfig:
 
     output_dir: Path = Path("outputs/demo-arm")
     demonstrations: int = 20
-    offline_updates: int = 60
-    steps: int = 1500
+    offline_updates: int = 80
+    steps: int = 1800
     eval_episodes: int = 40
     episode_s: float = 6.5  # simulated
     port: int = 8765
@@ -109,7 +109,7 @@ def _train(stages: Stages, config: ArmDemoConfig, data: Path, run: Path, arm: tu
         task, told = bar.add_task("online training", total=config.steps, note="imitation first"), time.monotonic()
         try:
             while process.poll() is None:
-                done, note = _progress(run)
+                done, note = _progress(run, config)
                 bar.update(task, completed=done, note=note)
                 if not stages.console.is_terminal and time.monotonic() - told > LOG_EVERY_S:
                     told = time.monotonic()
@@ -121,10 +121,10 @@ def _train(stages: Stages, config: ArmDemoConfig, data: Path, run: Path, arm: tu
     stages.check("train", process.returncode)
 
 
-def _progress(run: Path) -> tuple[int, str]:
+def _progress(run: Path, config: ArmDemoConfig) -> tuple[int, str]:
     episodes, evaluations = read_rows(run / "episodes.csv"), read_rows(run / "evaluations.csv")
     if not evaluations:
-        return 0, "imitation, and its evaluation"
+        return 0, f"imitation, then {config.eval_episodes} episodes to evaluate it"
     if not episodes:
         return 0, f"success {float(evaluations[-1]['success_rate']):.2f} after imitation"
     lately = [int(row["success"]) for row in episodes[-5:]]

@@ -122,7 +122,7 @@ def test_online_with_a_person_killed_and_resumed(
 
 
 @pytest.mark.parametrize(("options", "said"), [
-    (["--robot.type=sim_ur5e", "--env.type=ur5e_station"], "either an environment or an arm"),
+    (["--robot.type=sim_ur5e", "--env.type=ur5e_station"], "got both"),
     (["--robot.type=sim_ur5e", "--updates_per_step=1"], "would make the arm jerk"),
     (["--robot.type=sim_ur5"], "sim_ur5e"),
     (["--robot.type=sim_ur5e", "--robot.state=true", "--robot.camera_names=[left_shoulder]"], "Unknown camera of"),

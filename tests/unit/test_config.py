@@ -200,7 +200,7 @@ def test_runs_on_an_arm_have_defaults_of_their_own() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--env.type=ur5e_station"], "either an environment or an arm"),
+        (["--env.type=ur5e_station"], "got both"),
         (["--updates_per_step=1"], "would make the arm jerk"),
         (["--eval.batch_size=2"], "There is one arm"),
         (["--eval.use_async_envs=true"], "There is one arm"),

@@ -281,3 +281,14 @@ def test_of_two_people_who_press_at_once_one_is_refused() -> None:
             thread.join()
         assert len(refused) == 1
         assert made.labels == {0: Label.SUCCESS if refused == [Event.FAILURE] else Label.FAILURE}
+
+
+def test_after_a_pause_whoever_drove_drives_on() -> None:
+    made = session(State.TEACHING)
+    made.apply(Event.PAUSE)
+    assert made.apply(Event.RESUME) is State.TEACHING
+    made.apply(Event.ABSENT)
+    assert made.apply(Event.RESUME) is State.TEACHING
+    made.apply(Event.HAND_BACK)
+    made.apply(Event.PAUSE)
+    assert made.apply(Event.RESUME) is State.RUNNING

@@ -119,6 +119,7 @@ class Session:
     _next: int = 0
     _evaluations: int = 0
     _home: bool = False
+    _drove: bool = False
     _unlabelled: bool = False
     _relabelled: dict[int, Label] = field(default_factory=dict)
     _lock: threading.RLock = field(default_factory=threading.RLock, repr=False)
@@ -155,6 +156,9 @@ class Session:
             if event is Event.RECOVERED:
                 self.fault = ""
                 after = State.LABELLING if self._unlabelled else after
+            if event is Event.RESUME and self._drove:
+                after = State.TEACHING  # whoever held the leader goes on
+            self._drove = after is State.TEACHING or (self._drove and after is State.PAUSED)
             self.breaks += after in (State.PAUSED, State.FAULTED) and before is not after
             self.state = after
             self.on_change(self)

@@ -51,35 +51,23 @@ class SimUR5eConfig(RobotConfig):
 
     Joints are in degrees, the gripper from 0 (open) to 100 (closed); actions are absolute goals.
 
-    Attributes:
-        task: click_button, flip_cup, open_drawer_put_teddy or take_lid_off_saucepan.
-        speed: simulated seconds in a real one; at 4, forty control steps a second are ten of the arm's own.
-        ramp_s: simulated seconds in which the joints are led to a new goal.
-        camera_names: which of left_shoulder, right_shoulder, upper_wrist, lower_wrist.
-        image_height, image_width: pixels of each camera, 16 to 1024.
-        state: also give the objects' simulator state, as joints of their own (`object.*.pos`): learns without cameras.
-        seed: of the scenes.
-        world: name under which a leader in the same process finds this arm.
-        faults: what goes wrong, and when.
-        person: address of an operator's page that a simulated person answers at, with the token of CQN_PAGE_TOKEN.
-        person_takes_over_s: simulated seconds of an episode after which this person takes the leader; 0: never.
-
     Raises:
         ConfigError: a value that is not one of those named above.
     """
 
-    task: str = "click_button"
-    speed: float = 1.0
-    ramp_s: float = 0.1
+    task: str = "click_button"  # or flip_cup, open_drawer_put_teddy, take_lid_off_saucepan
+    speed: float = 1.0  # simulated seconds in a real one; at 4, forty control steps a second are ten of the arm's own
+    ramp_s: float = 0.1  # simulated seconds in which the joints are led to a new goal
+    # of left_shoulder, right_shoulder, upper_wrist, lower_wrist
     camera_names: list[str] = field(default_factory=lambda: list(CAMERAS))
-    image_height: int = 84
-    image_width: int = 84
-    state: bool = False
-    seed: int = 0
-    world: str = "default"
-    faults: list[Fault] = field(default_factory=list)
-    person: str = ""
-    person_takes_over_s: float = 0.0
+    image_height: int = 84  # pixels of each camera, 16 to 1024
+    image_width: int = 84  # pixels, 16 to 1024
+    state: bool = False  # also the objects' state, as joints of their own (object.*.pos): learns without cameras
+    seed: int = 0  # of the scenes
+    world: str = "default"  # name under which a leader in the same process finds this arm
+    faults: list[Fault] = field(default_factory=list)  # what goes wrong, and when
+    person: str = ""  # address of an operator's page where a simulated person answers (token: CQN_PAGE_TOKEN)
+    person_takes_over_s: float = 0.0  # simulated seconds of an episode until this person takes the leader; 0: never
 
     def __post_init__(self) -> None:
         super().__post_init__()

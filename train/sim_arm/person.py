@@ -49,7 +49,10 @@ class SimPerson:
                 time.sleep(0.2)
 
     def _look(self) -> None:
-        session = self._ask("/api/state")["session"]
+        seen = self._ask("/api/state")
+        if seen["control"]["you"] != "operator" and not seen["control"]["present"]:
+            self._ask("/api/control", {})  # who took it has left
+        session = seen["session"]
         world, state = self.world, str(session["state"])
         if state != self._state:
             self._state, self._since = state, world.now

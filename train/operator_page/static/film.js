@@ -3,6 +3,10 @@ const LABELS = { success: "Success", failure: "Failure", discard: "Discard" };
 const MAX_ROWS = 50;
 const $ = (id) => document.getElementById(id);
 
+function called(episode) {
+  return episode < 0 ? `Evaluation ${-episode}` : `Episode ${episode}`;
+}
+
 export class Films {
   constructor(request, relabel) {
     this.request = request;
@@ -28,6 +32,7 @@ export class Films {
   }
 
   list(finished, operator, session) {
+    operator = operator && session.state !== "stopped"; // nobody learns from labels any more
     const rows = JSON.stringify([finished, operator]);
     if (rows !== this.rows) {
       this.rows = rows;
@@ -55,11 +60,11 @@ export class Films {
     length.textContent = [entry.seconds === null ? "" : `${entry.seconds.toFixed(1)} s`, entry.steps === null ? "" : `${entry.steps} steps`, entry.label ? "" : "no label"]
       .filter(Boolean).join(" · ");
     row.append(number, length);
-    if (entry.film) row.append(this.button("Film", `film-${entry.episode}`, () => this.open(entry), `Play the film of episode ${entry.episode}`));
+    if (entry.film) row.append(this.button("Film", `film-${entry.episode}`, () => this.open(entry), `Play the film of ${called(entry.episode).toLowerCase()}`));
     const labels = document.createElement("span");
     labels.className = "labels";
     for (const [label, word] of Object.entries(LABELS)) {
-      const name = `Label episode ${entry.episode} as ${word.toLowerCase()}`;
+      const name = `Label ${called(entry.episode).toLowerCase()} as ${word.toLowerCase()}`;
       const button = this.button(word, `${label}-${entry.episode}`, () => this.relabel(entry.episode, label), name);
       button.dataset.label = label;
       button.setAttribute("aria-pressed", String(entry.label === label));
@@ -85,7 +90,7 @@ export class Films {
     const film = { episode, length: 0, cameras: [] };
     this.film = film;
     $("player").hidden = false;
-    $("film-title").textContent = `Episode ${episode}: loading …`;
+    $("film-title").textContent = `${called(episode)}: loading …`;
     $("film-pictures").replaceChildren();
     for (const name of cameras) {
       const path = `/api/film/${episode}/${encodeURIComponent(name)}`;
@@ -95,7 +100,7 @@ export class Films {
       const { times } = await answer.json();
       const figure = document.createElement("figure");
       const image = document.createElement("img");
-      image.alt = `Episode ${episode}, camera ${name}`;
+      image.alt = `${called(episode)}, camera ${name}`;
       const caption = document.createElement("figcaption");
       caption.textContent = name;
       figure.append(image, caption);
@@ -105,13 +110,13 @@ export class Films {
     }
     if (this.film !== film) return;
     if (!film.cameras.length) {
-      $("film-title").textContent = `Episode ${episode}: its film is no longer kept.`;
+      $("film-title").textContent = `${called(episode)}: its film is no longer kept.`;
       return;
     }
     const enough = this.load(film);
     await enough;
     if (this.film !== film) return;
-    $("film-title").textContent = `Episode ${episode}, at the speed at which it happened`;
+    $("film-title").textContent = `${called(episode)}, at the speed at which it happened`;
     this.at(0);
     this.play();
   }
@@ -126,7 +131,7 @@ export class Films {
         const answer = await this.request(`${camera.path}?frame=${index}`).catch(() => null);
         if (answer && answer.ok) camera.urls[index] = URL.createObjectURL(await answer.blob());
         done += 1;
-        if (this.film === film) $("film-title").textContent = `Episode ${film.episode}: loading ${Math.round((100 * done) / (done + jobs.length))} %`;
+        if (this.film === film) $("film-title").textContent = `${called(film.episode)}: loading ${Math.round((100 * done) / (done + jobs.length))} %`;
       }
     };
     await Promise.all([worker(), worker(), worker()]);

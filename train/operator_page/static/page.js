@@ -7,7 +7,7 @@ const $ = (id) => document.getElementById(id);
 const WORDS = {
   waiting: ["Ready", "Press Start (Space) for the next episode."],
   running: ["Running", "The policy drives. Success (S), Failure (F), or Pause (Space)."],
-  paused: ["Paused", "The arm holds. Resume (Space), or end the episode: S, F or D."],
+  paused: ["Paused", "The arm holds. Resume (Space) as before the pause, or end the episode: S, F or D."],
   teaching: ["You drive", "Recorded as a demonstration. Hand back (T), or end it: S, F or D."],
   labelling: ["How did it go?", "The time is up. Press Success (S), Failure (F) or Discard (D)."],
   resetting: ["Reset the scene", "Reset the scene, then press Ready (R). Mind the arm: it may be on its way home."],
