@@ -54,7 +54,7 @@ alias. A camera may be named in full (observation.images.top) or by its last par
 
         if not view.cameras:
             raise ConfigError(
-                "The dataset has no camera: there is nothing to resize; for an arm without cameras use the recipe arm_state."
+                "The dataset has no camera: there is nothing to resize; without cameras use the recipe arm_state."
             )
         crops = {_camera(view, name): tuple(box) for name, box in self.crop.items()}
         chosen = [_camera(view, name) for name in self.cameras] or list(view.cameras)
