@@ -304,7 +304,7 @@ def test_wrong_options(
     ("left_out", "said"),
     [
         ("--policy.", ["No policy", "--policy.type=cqn"]),
-        ("--env.", ["an environment or an arm", "--env.type=ur5e_station", "--robot.type="]),
+        ("--env.", ["No environment and no arm", "--env.type=ur5e_station", "--robot.type="]),
         ("--env.type", ["--env.obs_type=state", "give --env.type="]),
         ("--dataset.", ["No demonstrations", "--dataset.repo_id="]),
         ("--output_dir", ["No output directory", "--output_dir=DIR"]),
