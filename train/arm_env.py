@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 
 from .attendant import Attendant
 from .interfaces import Frame, Interrupted, Label, Outcome
-from .operator_page.session import Event, RefusedError, Session, State
+from .operator_page.session import IN_MOTION, Event, RefusedError, Session, State
 from .robot.arm import Arm
 from .robot.guard import HeldError, Reading, RobotFault, StoppedError
 from .robot.pace import Pace
 
 __all__ = ["ArmEnvironment", "Display"]
 
-DRIVEN = (State.RUNNING, State.TEACHING)
 LOOK_S = 0.05  # how often a waiting thread looks whether it should stop
 
 
@@ -92,7 +91,7 @@ class ArmEnvironment:
         before = self._episode()
         self.session.learning("")
         # An episode may be over, or paused, before this thread has seen that it began.
-        self._wait(lambda: self.session.state in DRIVEN or self._episode() != before)
+        self._wait(lambda: self.session.state in IN_MOTION or self._episode() != before)
         self.arm.let_go()
         self._steps, self._began = 0, time.monotonic()
         self.display.begin_episode(self.session.episode)
@@ -100,7 +99,7 @@ class ArmEnvironment:
             self.arm.guard.engage()  # where it was let go to be moved by hand
             self._look()
         except RobotFault as error:  # the episode ends with the first step, which does not happen
-            self._fault(error)
+            self._attendant.fault(error)
         self._pace.start()
         return self._frame
 
@@ -111,13 +110,13 @@ class ArmEnvironment:
             if not teaching:
                 self.arm.let_go()
             wanted = self.arm.follow() if teaching else action[0].double().cpu().numpy()
-            sent = self.arm.guard.send(wanted, lambda: self.session.state in DRIVEN)
+            sent = self.arm.guard.send(wanted, lambda: self.session.state in IN_MOTION)
             self._pace.wait()
             frame = self._look()
         except (HeldError, StoppedError):
             return self._break()
         except RobotFault as error:
-            self._fault(error)
+            self._attendant.fault(error)
             return self._break()
         if self.session.breaks != breaks:  # paused meanwhile, even if it is driven again
             return self._break()
@@ -151,8 +150,7 @@ class ArmEnvironment:
         self._pictures = reading.pictures
         self._frame = self.arm.frame(reading)
         self.display.show(reading.pictures)
-        limited = ", ".join(f"{name} {count}" for name, count in self.arm.guard.interventions.items())
-        self.display.health(**self._pace.statistics(), limited=limited or "no goal")
+        self.display.health(**self._pace.statistics(), limited=self._limited() or "no goal")
         return self._frame
 
     def summary(self) -> str:
@@ -160,11 +158,15 @@ class ArmEnvironment:
         kept = self._pace.statistics()
         if not kept:
             return ""
-        limited = ", ".join(f"{name} {count}" for name, count in self.arm.guard.interventions.items())
         return (
             f"Control: {kept['rate_hz']:.1f} Hz of {self.fps}, jitter {kept['jitter_ms']:.1f} ms, longest period "
-            f"{kept['worst_ms']:.0f} ms, {kept['late']:.0f} ticks late. Limits changed goals: {limited or 'never'}."
+            f"{kept['worst_ms']:.0f} ms, {kept['late']:.0f} ticks late. Limits changed goals: "
+            f"{self._limited() or 'never'}."
         )
+
+    def _limited(self) -> str:
+        """How often each limit changed a goal; "" where none did."""
+        return ", ".join(f"{name} {count}" for name, count in self.arm.guard.interventions.items())
 
     def _label(self) -> Label | None:
         """What the person said of the present episode, if they have."""
@@ -178,7 +180,7 @@ class ArmEnvironment:
     def _break(self) -> Outcome:
         """After a pause or a fault: the episode goes on with a new frame, or it has ended with the step before."""
         while True:
-            self._wait(lambda: self.session.state in DRIVEN or self._label() is not None)
+            self._wait(lambda: self.session.state in IN_MOTION or self._label() is not None)
             label = self._label()
             if label is not None:
                 return self._ended(self._frame, label, out_of_time=False, skipped=True)
@@ -186,7 +188,7 @@ class ArmEnvironment:
             try:
                 frame = self._look()
             except RobotFault as error:
-                self._fault(error)
+                self._attendant.fault(error)
                 continue
             self._pace.start()
             return Outcome(frame, 0.0, False, False, False, skipped=True)
@@ -206,11 +208,7 @@ class ArmEnvironment:
         while self._label() is None:
             with contextlib.suppress(RefusedError):  # paused, labelled or stopped at this very moment
                 self.session.apply(Event.TIME_UP)
-            self._wait(lambda: self._label() is not None or self.session.state in DRIVEN)
-
-    def _fault(self, error: RobotFault) -> None:
-        with contextlib.suppress(RefusedError):  # stopped already
-            self.session.apply(Event.FAULT, str(error))
+            self._wait(lambda: self._label() is not None or self.session.state in IN_MOTION)
 
     def _wait(self, ready: Callable[[], bool]) -> None:
         """Until something is so. Raises Interrupted after a stop of the person or of the process."""

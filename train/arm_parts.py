@@ -24,21 +24,20 @@ from .agent import Agent
 from .arm_env import ArmEnvironment
 from .config import DatasetSettings, RunConfig
 from .demonstrations import load_metadata
+from .interfaces import PAGE_TOKEN
 from .operator_page.board import Board
 from .operator_page.session import Session
-from .robot.arm import Arm
+from .robot.arm import Arm, state_names
 from .robot.guard import Guard, GuardSettings
 from .robot.limits import Forward, Limits
 from .robot.settings import ArmSettings
 from .stages import read_rows
 
-__all__ = ["TOKEN", "Operated", "make_operated", "recall", "steering"]
+__all__ = ["Operated", "make_operated", "recall", "steering"]
 
 Array = NDArray[np.float64]
-TOKEN = "CQN_PAGE_TOKEN"  # noqa: S105  # the variable's name: a token in an option would be saved with the run
-ABSOLUTE_SHARE = (
-    0.05  # of a joint's range: the largest step where actions are goals, so that none says how far is usual
-)
+# Of a joint's range: the largest step where actions are goals, so that none says how far is usual.
+ABSOLUTE_SHARE = 0.05
 
 
 @dataclass(frozen=True)
@@ -102,10 +101,8 @@ def steering(config: RunConfig, operated: Operated, say: Callable[[str], None]) 
         return
     from .operator_page.server import OperatorServer
 
-    page = config.page
-    with OperatorServer(
-        operated.board, page.host, page.port, os.environ.get(TOKEN) or None, page.absent_s
-    ) as server:  # fmt: skip
+    page, token = config.page, os.environ.get(PAGE_TOKEN) or None
+    with OperatorServer(operated.board, page.host, page.port, token, page.absent_s) as server:
         say(f"Operator's page: {server.url}")
         yield
 
@@ -122,7 +119,7 @@ def check_robot_fits(robot: Robot, agent: Agent) -> None:
     """Cameras, state and action must be those of the policy. Raises ConfigError where they are not."""
     needed, features = agent.policy.config.input_features or {}, robot.observation_features
     cameras = [name for name, kind in features.items() if isinstance(kind, tuple)]
-    states = [name for name, kind in features.items() if kind is float]
+    states = state_names(robot)
     for key, feature in needed.items():
         if feature.type is FeatureType.VISUAL and (name := key.rpartition(".")[2]) not in cameras:
             raise ConfigError(one_of("camera of the robot", name, cameras) + " The policy was trained with it.")
@@ -146,7 +143,7 @@ def limits_of(robot: Robot, agent: Agent, settings: ArmSettings, fps: int) -> Li
     Raises ConfigError for joints that are not the robot's, or where neither data nor settings say a limit.
     """
     names = tuple(robot.action_features)
-    states = [name for name, kind in robot.observation_features.items() if kind is float]
+    states = state_names(robot)
     for name in (*settings.joint_limits, *settings.home):
         if name not in names:
             raise ConfigError(one_of("joint", name, names))
@@ -186,7 +183,7 @@ def home_of(dataset: DatasetSettings, robot: Robot, settings: ArmSettings) -> Ar
         data = LeRobotDataset(dataset.repo_id, root=dataset.root, episodes=dataset.episodes)
         columns = data.hf_dataset.with_format("numpy")
         first = np.unique(np.asarray(columns["episode_index"]), return_index=True)[1]
-        states = [name for name, kind in robot.observation_features.items() if kind is float]
+        states = state_names(robot)
         if OBS_STATE in data.features:
             median = np.median(np.stack([columns[int(row)][OBS_STATE] for row in first]), axis=0)
             home = dict(zip(states, median.tolist(), strict=True))
@@ -216,7 +213,7 @@ def _made(kind: str, make: Callable[[Any], Any], config: Any) -> Any:
 
 def _check_names(robot: Robot, features: dict[str, Any]) -> None:
     """A robot with other joints, or in another order, would be driven wrongly. Raises DataError."""
-    states = [name for name, kind in robot.observation_features.items() if kind is float]
+    states = state_names(robot)
     for key, own in ((OBS_STATE, states), (ACTION, list(robot.action_features))):
         names = features.get(key, {}).get("names")
         if isinstance(names, list | tuple) and list(names) != own:

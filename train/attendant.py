@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .operator_page.session import Event, RefusedError, Session, State
+from .operator_page.session import IN_MOTION, Event, RefusedError, Session, State
 from .robot.arm import Arm
 from .robot.guard import HeldError, RobotFault, StoppedError
 
 __all__ = ["Attendant"]
 
 BETWEEN = (State.WAITING, State.RESETTING)
-DRIVEN = (State.RUNNING, State.TEACHING)
 LOOK_HZ = 10.0
 RETRY_S = 0.5
 
@@ -55,10 +54,15 @@ class Attendant:
         self._homeward = True
         self._wake.set()
 
+    def fault(self, error: RobotFault) -> None:
+        """Let the session know; from then on this thread tries to take the arm up again."""
+        with contextlib.suppress(RefusedError):  # stopped already
+            self.session.apply(Event.FAULT, str(error))
+
     def _on_change(self, session: Session) -> None:
         if session.state is State.STOPPED:
             self.arm.guard.refuse()  # at once, whatever the attendant is at
-        if session.state in (*DRIVEN, State.FAULTED):
+        if session.state in (*IN_MOTION, State.FAULTED):
             self._homeward = False  # after a fault the arm does not set off by itself while it is looked after
         self._wake.set()
         with self.changed:
@@ -76,21 +80,21 @@ class Attendant:
             except (HeldError, StoppedError):  # somebody else has taken over
                 pass
             except RobotFault as error:
-                self._fault(error)
+                self.fault(error)
             except Exception as error:  # without this thread nobody would hold the arm
-                self._fault(RobotFault(f"Looking after the arm failed: {error!r}"))
+                self.fault(RobotFault(f"Looking after the arm failed: {error!r}"))
             before = state
 
     def _attend(self, state: State, before: State) -> None:
         guard = self.arm.guard
         if state is State.STOPPED:
             guard.stop()
-        elif state in DRIVEN:
+        elif state in IN_MOTION:
             return
         elif state is State.FAULTED:
             self._recover()
             return
-        elif before in DRIVEN or (state is State.PAUSED and before is not state):
+        elif before in IN_MOTION or (state is State.PAUSED and before is not state):
             guard.hold()
         if self.session.free != guard.released and state is not State.STOPPED:
             guard.release() if self.session.free else guard.engage()
@@ -119,12 +123,8 @@ class Attendant:
             self.arm.guard.recover()
         except RobotFault as error:
             if self.session.fault != str(error):
-                self._fault(error)
+                self.fault(error)
             self._closing.wait(RETRY_S)
             return
         with contextlib.suppress(RefusedError):  # stopped meanwhile
             self.session.apply(Event.RECOVERED)
-
-    def _fault(self, error: RobotFault) -> None:
-        with contextlib.suppress(RefusedError):  # stopped already
-            self.session.apply(Event.FAULT, str(error))

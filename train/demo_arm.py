@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from .arm_parts import TOKEN
+from .interfaces import PAGE_TOKEN
 from .stages import Stages, fresh, read_rows, run_once
 
 __all__ = ["ArmDemoConfig", "main", "run_demo"]
@@ -86,7 +86,7 @@ def _train(stages: Stages, config: ArmDemoConfig, data: Path, run: Path, arm: tu
     """Online training with a progress bar, from the last checkpoint where there is one."""
     if any(row["phase"] == "final" for row in read_rows(run / "evaluations.csv")):
         return
-    stages.environment[TOKEN] = os.environ.get(TOKEN) or secrets.token_urlsafe(16)
+    stages.environment[PAGE_TOKEN] = os.environ.get(PAGE_TOKEN) or secrets.token_urlsafe(16)
     if (run / "checkpoints" / "last").exists():
         arguments = ["--resume=true", f"--output_dir={run}"]
     else:
@@ -101,7 +101,7 @@ def _train(stages: Stages, config: ArmDemoConfig, data: Path, run: Path, arm: tu
             "--save_freq=500",
         ]  # fmt: skip
     process = stages.start("train", "cqn_train.cli", *arguments)
-    page = f"http://127.0.0.1:{config.port}/?token={stages.environment[TOKEN]}"
+    page = f"http://127.0.0.1:{config.port}/?token={stages.environment[PAGE_TOKEN]}"
     stages.console.print(f"  watch it at the operator's page: {page}", soft_wrap=True)
     columns = (TextColumn("  {task.description}"), BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("eta"),
                TimeRemainingColumn(), TextColumn("{task.fields[note]}"))  # fmt: skip

@@ -8,9 +8,11 @@ from typing import Any, Protocol
 import torch
 from numpy.typing import NDArray
 
-__all__ = ["Environment", "Frame", "Interrupted", "Label", "Outcome", "Outcomes", "Person", "Scenes"]
+__all__ = ["PAGE_TOKEN", "Environment", "Frame", "Interrupted", "Label", "Outcome", "Outcomes", "Person", "Scenes"]
 
 Frame = dict[str, Any]
+# The variable that holds the token of the operator's page: one in an option would be saved with the run.
+PAGE_TOKEN = "CQN_PAGE_TOKEN"  # noqa: S105  # the variable's name
 
 
 class Interrupted(Exception):  # noqa: N818  # a request, not an error

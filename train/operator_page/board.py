@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .control import IN_MOTION
 from .films import Films, Picture, is_picture, to_jpeg
-from .session import IN_EPISODE, Label, Session, State
+from .session import IN_EPISODE, IN_MOTION, Label, Session, State
 
 __all__ = ["Board"]
 

@@ -8,12 +8,11 @@ from typing import Any
 
 from lerobot_cqn.errors import CQNError
 
-from .session import BY_ITSELF, Event, Label, RefusedError, Session, State
+from .session import BY_ITSELF, IN_MOTION, Event, Label, RefusedError, Session, State
 
-__all__ = ["IN_MOTION", "Control", "ViewingOnlyError"]
+__all__ = ["Control", "ViewingOnlyError"]
 
 LEFT_S = 2.0  # after the operator's page is closed; loading it anew takes less
-IN_MOTION = frozenset({State.RUNNING, State.TEACHING})
 
 
 class ViewingOnlyError(CQNError, PermissionError):

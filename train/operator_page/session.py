@@ -16,7 +16,7 @@ from lerobot_cqn.errors import CQNError
 
 from ..interfaces import Label
 
-__all__ = ["TRANSITIONS", "Event", "Label", "RefusedError", "Session", "State"]
+__all__ = ["IN_MOTION", "TRANSITIONS", "Event", "Label", "RefusedError", "Session", "State"]
 
 
 class State(StrEnum):
@@ -57,7 +57,8 @@ LABELS: Mapping[Event, Label] = {
     Event.SUCCESS: Label.SUCCESS, Event.FAILURE: Label.FAILURE, Event.DISCARD: Label.DISCARD,
 }  # fmt: skip
 BY_ITSELF = frozenset({Event.TIME_UP, Event.ABSENT, Event.FAULT, Event.RECOVERED})
-IN_EPISODE = frozenset({State.RUNNING, State.PAUSED, State.TEACHING, State.LABELLING})
+IN_MOTION = frozenset({State.RUNNING, State.TEACHING})  # policy or person drives the arm
+IN_EPISODE = IN_MOTION | {State.PAUSED, State.LABELLING}
 
 _ENDS = dict.fromkeys(LABELS, State.RESETTING)
 _ALWAYS = {Event.STOP: State.STOPPED, Event.FAULT: State.FAULTED}
@@ -134,14 +135,8 @@ class Session:
                 raise RefusedError(
                     f"'{event}' has no place while {self.state}: expected one of {', '.join(self.allowed())}."
                 )
-            if event is Event.START and self.busy:
-                raise RefusedError(f"An episode cannot start while the learner is busy ({self.busy}): wait for it.")
-            if event is Event.TAKE_OVER and self.evaluating:
-                raise RefusedError("An evaluation is on: the policy must do it alone; discard it, or wait.")
-            if event is Event.TAKE_OVER and not self.leader:
-                raise RefusedError("There is no leader arm to take over with: start the run with --teleop.type=...")
-            if event is Event.FREE and not self.can_free:
-                raise RefusedError("This robot cannot be moved by hand: it has no motor bus that lets go.")
+            if obstacle := self._obstacle(event):
+                raise RefusedError(obstacle)
             before, after = self.state, TRANSITIONS[self.state][event]
             if event is Event.START:
                 self._count()
@@ -219,14 +214,20 @@ class Session:
     def allowed(self) -> list[Event]:
         """What a person may do now."""
         with self._lock:
-            events = [event for event in TRANSITIONS[self.state] if event not in BY_ITSELF]
-            return [
-                event
-                for event in events
-                if not (event is Event.START and self.busy)
-                and not (event is Event.TAKE_OVER and (self.evaluating or not self.leader))
-                and not (event is Event.FREE and not self.can_free)
-            ]
+            events = TRANSITIONS[self.state]
+            return [event for event in events if event not in BY_ITSELF and not self._obstacle(event)]
+
+    def _obstacle(self, event: Event) -> str:
+        """What stands against an event that the state allows, for people; "" where nothing does."""
+        if event is Event.START and self.busy:
+            return f"An episode cannot start while the learner is busy ({self.busy}): wait for it."
+        if event is Event.TAKE_OVER and self.evaluating:
+            return "An evaluation is on: the policy must do it alone; discard it, or wait."
+        if event is Event.TAKE_OVER and not self.leader:
+            return "There is no leader arm to take over with: start the run with --teleop.type=..."
+        if event is Event.FREE and not self.can_free:
+            return "This robot cannot be moved by hand: it has no motor bus that lets go."
+        return ""
 
     def snapshot(self) -> dict[str, Any]:
         """All of it as plain values, for a page or a log."""

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
+from lerobot.robots.robot import Robot
 from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from numpy.typing import NDArray
@@ -16,10 +17,15 @@ from .guard import Guard, Reading, RobotFault
 from .limits import Limits
 from .settings import ArmSettings
 
-__all__ = ["Arm"]
+__all__ = ["Arm", "state_names"]
 
 Array = NDArray[np.float64]
 AT_HOME = 0.1  # share of the largest step within which the arm counts as being at home
+
+
+def state_names(robot: Robot) -> list[str]:
+    """Names of the values P in a robot's state, in the order in which LeRobot records them."""
+    return [name for name, kind in robot.observation_features.items() if kind is float]
 
 
 class Arm:
@@ -51,7 +57,7 @@ class Arm:
         self.names, self.home = guard.names, home
         self._clutched = list(clutched)
         self._offset: Array | None = None
-        self._states = [name for name, kind in guard.robot.observation_features.items() if kind is float]
+        self._states = state_names(guard.robot)
         if leader is not None:
             missing = [name for name in self.names if name not in leader.action_features]
             if missing:

@@ -8,11 +8,11 @@ import urllib.error
 import urllib.request
 from typing import Any
 
+from ..interfaces import PAGE_TOKEN
 from .world import World
 
-__all__ = ["TOKEN", "SimPerson"]
+__all__ = ["SimPerson"]
 
-TOKEN = "CQN_PAGE_TOKEN"  # noqa: S105  # the variable's name
 LOOK_S = 0.03
 SURE_S = 0.2  # simulated seconds for which the task must look done
 
@@ -82,7 +82,7 @@ class SimPerson:
         request = urllib.request.Request(  # noqa: S310  # an address that the user gave
             f"{self.url}{path}?client=simulated-person",
             data=None if body is None else json.dumps(body).encode(),
-            headers={"X-Token": os.environ.get(TOKEN, ""), "Content-Type": "application/json"},
+            headers={"X-Token": os.environ.get(PAGE_TOKEN, ""), "Content-Type": "application/json"},
         )
         try:
             with urllib.request.urlopen(request, timeout=2) as answer:  # noqa: S310
