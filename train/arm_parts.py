@@ -190,7 +190,7 @@ def home_of(dataset: DatasetSettings, robot: Robot, settings: ArmSettings) -> Ar
     home |= settings.home
     missing = [name for name in names if name not in home]
     if missing:
-        raise ConfigError(f"Where is home for '{missing[0]}'? Give it with --arm.home, or --arm.go_home=false.")
+        raise ConfigError(f"Where is home for '{missing[0]}'? Give it, e.g. --arm.home='{{{missing[0]}: 0}}'.")
     return np.array([home[name] for name in names])
 
 

@@ -93,12 +93,12 @@ def _train(stages: Stages, config: ArmDemoConfig, data: Path, run: Path, arm: tu
         arguments = [
             "--policy.type=cqn", "--policy.preset=laptop_state", "--policy.device=cpu", *arm,
             "--robot.camera_names=[left_shoulder]", "--robot.image_height=168", "--robot.image_width=224",
-            f"--robot.person=http://127.0.0.1:{config.port}", "--robot.person_takes_over_s=4.5",
+            f"--robot.person=http://127.0.0.1:{config.port}", "--robot.person_takes_over_s=3.5",
             "--teleop.type=sim_leader", "--dataset.repo_id=demo/clean", f"--dataset.root={data}",
             f"--output_dir={fresh(run)}", f"--seed={config.seed}", f"--offline_updates={config.offline_updates}",
             f"--steps={config.steps}", f"--eval.final_n_episodes={config.eval_episodes}",
             f"--arm.episode_s={config.episode_s / CLOCK}", f"--page.port={config.port}", "--threads=1",
-            "--save_freq=500",
+            "--updates_per_episode=100", "--save_freq=500",
         ]  # fmt: skip
     process = stages.start("train", "cqn_train.cli", *arguments)
     page = f"http://127.0.0.1:{config.port}/?token={stages.environment[PAGE_TOKEN]}"

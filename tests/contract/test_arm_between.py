@@ -87,7 +87,7 @@ def test_home_is_asked_for_at_the_page(arm: Bench) -> None:
         arm.step(15)
     arm.do(Event.SUCCESS)
     arm.step()
-    assert arm.at_rest()
+    soon(arm.at_rest)
     assert np.abs(arm.joints - HOME_DEG[:6]).max() > 5
     arm.do(Event.HOME)
     soon(lambda: np.abs(arm.joints - HOME_DEG[:6]).max() < 0.5)

@@ -138,7 +138,7 @@ def test_home_is_where_the_demonstrations_start(demonstrations: DatasetSettings)
 def test_home_must_be_known_for_every_joint() -> None:
     everything = {name: float(i) for i, name in enumerate(ACTION_NAMES)}
     assert home_of(DatasetSettings(), robot(), ArmSettings(home=everything)).tolist() == [0, 1, 2, 3]
-    with pytest.raises(ConfigError, match=r"Where is home for 'lift\.pos'\?.*--arm\.go_home=false"):
+    with pytest.raises(ConfigError, match=r"Where is home for 'lift\.pos'\?.*--arm\.home='\{lift\.pos: 0\}'"):
         home_of(DatasetSettings(), robot(), ArmSettings(home={"pan.pos": 1.0}))
 
 
