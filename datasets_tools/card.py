@@ -1,6 +1,6 @@
 """The card (README.md) of a dataset on the Hub: what it is, its action bounds, how it came about, how to train on it.
 
-Everything between two markers is written anew by each push; the rest of a card that a person wrote stays as it is.
+The part between two marks is written anew by each push; the rest of a card that a person wrote stays as it is.
 """
 
 from collections import Counter
@@ -9,21 +9,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from lerobot_cqn.errors import DataError
 from lerobot_cqn.schema import NEXT_REWARD, NEXT_SUCCESS, dimension_names
+from lerobot_cqn.story import code, plain, tell
 
 from .deltas import ACTION
+from .readme import Readme, union
 from .resize import picture_size
 from .source import Source
-from .story import code, plain, tell
 
-__all__ = ["END", "START", "Facts", "Labels", "look", "own_text", "write_card"]
+__all__ = ["TOOL", "Facts", "Labels", "look", "write_card"]
 
-START = "<!-- cqn-data push: start. Each push writes the text down to the end mark anew. -->"
-END = "<!-- cqn-data push: end -->"
+TOOL = "cqn-data push"
 LICENSE, TAGS = "apache-2.0", ("LeRobot", "cqn-data")
 MOST = 20  # tasks, or numbers of episodes, named in full
 # As LeRobot's own card has it, so that the Hub's viewer finds the tables.
@@ -140,47 +138,13 @@ def write_card(facts: Facts, labels: Labels, base: str | None = None) -> str:
     Raises:
         DataError: the front matter of ``base`` is not YAML.
     """
-    front, text = _front_matter(base or "")
-    before, after = _around(text)
+    there = Readme.read(base or "", TOOL)
+    front = dict(there.front)
     front["license"] = labels.license or front.get("license") or LICENSE
-    front["task_categories"] = _union(front.get("task_categories"), ["robotics"])
-    front["tags"] = _union(front.get("tags"), [*TAGS, *labels.tags])
+    front["task_categories"] = union(front.get("task_categories"), ["robotics"])
+    front["tags"] = union(front.get("tags"), [*TAGS, *labels.tags])
     front.setdefault("configs", CONFIGS)
-    head = yaml.safe_dump(front, sort_keys=False, allow_unicode=True, width=1000)
-    start = before.strip("\n") or f"# {labels.repo_id.partition('/')[2]}"
-    parts = [start, START, _section(facts, labels, str(front["license"])), END, *([after] if after else [])]
-    return f"---\n{head}---\n\n" + "\n\n".join(parts) + "\n"
-
-
-def own_text(card: str) -> str:
-    """What a person wrote in a card: all but the part between the markers and the front matter."""
-    before, after = _around(_front_matter(card)[1])
-    return f"{before.strip()}\n{after.strip()}".strip()
-
-
-def _front_matter(card: str) -> tuple[dict[str, Any], str]:
-    lines = card.removeprefix("\ufeff").splitlines()
-    if not lines or lines[0].rstrip() != "---":
-        return {}, "\n".join(lines)
-    ends = [i for i, line in enumerate(lines) if i and line.rstrip() == "---"]
-    try:
-        front = yaml.safe_load("\n".join(lines[1 : ends[0]])) if ends else None
-    except yaml.YAMLError as error:
-        raise DataError(f"The front matter of README.md is not YAML: {' '.join(str(error).split())[:200]}") from error
-    if not ends or not isinstance(front, dict | None):
-        raise DataError("The front matter of README.md, between two lines ---, must be YAML of names and values.")
-    return dict(front or {}), "\n".join(lines[ends[0] + 1 :])
-
-
-def _around(text: str) -> tuple[str, str]:
-    before, found, rest = text.partition(START)
-    _, ended, after = rest.partition(END)
-    return (before, after.strip("\n")) if found and ended else (text, "")
-
-
-def _union(there: Any, more: Sequence[str]) -> list[str]:
-    old = [there] if isinstance(there, str) else [str(v) for v in there or []]
-    return list(dict.fromkeys([*old, *more]))
+    return there.with_part(front, _section(facts, labels, str(front["license"])), labels.repo_id.partition("/")[2])
 
 
 def _section(facts: Facts, labels: Labels, license: str) -> str:

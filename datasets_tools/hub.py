@@ -1,4 +1,4 @@
-"""Send files to a dataset repository of the Hugging Face Hub as one commit: resumable, retried, errors in one line.
+"""Send files to a repository of the Hugging Face Hub as one commit: resumable, retried, errors in one line.
 
 Content goes first, a batch of files at a time; what has arrived is not sent again, also not by a later run. The commit
 that makes it visible comes last, so the repository shows the old files or the new ones and never a part.
@@ -19,7 +19,6 @@ from huggingface_hub import (
     HfApi,
     constants,
     get_session,
-    get_token,
 )
 from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
 from huggingface_hub.hf_api import RepoFile
@@ -29,39 +28,21 @@ from rich.console import Console
 from lerobot_cqn.errors import CQNError, DataError
 
 from .console import Interrupted, note, progress
+from .hub_errors import PASSING, HubError, cause, passing, said, transport
 from .hub_files import Content, Hashes, batches, size_of
 
-__all__ = ["MANAGED", "Hub", "HubError", "Sent", "refuse_to_start"]
+__all__ = ["MANAGED", "Hub", "HubError", "Sent"]
 
-DATASET = "dataset"
-MANAGED = ("data/", "meta/", "videos/")  # a dataset's own folders: what lies there and is not sent is removed
+# By kind of repository: what begins so and is not sent is removed, since only the tools write there.
+MANAGED = {
+    "dataset": ("data/", "meta/", "videos/"),
+    "model": ("videos/", "training/", "policy_preprocessor", "policy_postprocessor"),
+}
 WAITS = (1.0, 2.0, 4.0, 8.0)  # seconds before each further try
-PASSING = (408, 429, 500, 502, 503, 504)  # answers that may be another one later
 REPORT_EVERY = 60.0  # seconds between remarks where no bar can be drawn
 TIMEOUT = httpx.Timeout(120, connect=20)  # seconds without any byte; the library's own is for ever
 
 _wait = time.sleep
-
-
-class HubError(CQNError):
-    """The Hub refused or could not be reached; the message ends with the command that goes on."""
-
-
-def refuse_to_start() -> None:
-    """Make sure that the Hub may be asked at all.
-
-    Raises:
-        HubError: offline mode is on, or nobody is logged in.
-    """
-    if constants.is_offline_mode():
-        raise HubError(
-            "HF_HUB_OFFLINE (or TRANSFORMERS_OFFLINE) is set, which forbids any connection; unset it and push again,"
-            " or look at what would be sent with --dry_run."
-        )
-    if not get_token():
-        raise HubError(
-            "Nobody is logged in to the Hub: run `hf auth login` with a token that may write, or set HF_TOKEN."
-        )
 
 
 @dataclass
@@ -85,22 +66,46 @@ class Sent:
 
 
 class Hub:
-    """One dataset repository."""
+    """One repository."""
 
-    def __init__(self, repo_id: str, again: str, branch: str | None = None) -> None:
+    def __init__(self, repo_id: str, again: str, branch: str | None = None, kind: str = "dataset") -> None:
         """Nothing is sent yet.
 
         Args:
             repo_id: ``user/name``.
             again: the command to run once more, told in errors.
             branch: by default the main one.
+            kind: "dataset" or "model", as the Hub calls policies.
         """
+        self.kind = kind
         self.api = HfApi(endpoint=constants.ENDPOINT)
         self.repo_id = repo_id
         self.again = again
         self.branch = branch or constants.DEFAULT_REVISION
         self._hashes = Hashes()
         self._state = ""  # how far it has come, for errors
+
+    def check_account(self) -> None:
+        """Ask who is logged in, and whether the repository's name is theirs; nothing is made.
+
+        Raises:
+            HubError: the token is refused, or the name belongs to somebody else.
+            ConnectionError: the Hub cannot be reached now.
+        """
+        owner = self.repo_id.partition("/")[0]
+        try:
+            account = self.api.whoami()
+        except Exception as error:  # the client and its transport raise kinds of their own
+            behind = cause(error)
+            if passing(behind):
+                raise ConnectionError(said(behind)) from error
+            raise self._explained(behind) from error
+        names = {account["name"], *(org["name"] for org in account.get("orgs", []))}
+        if owner not in names:
+            raise HubError(
+                f"'{account['name']}' is logged in to the Hub and may not write to {self.repo_id}: expected a name that"
+                f" begins with {' or '.join(f'{name}/' for name in sorted(names))}."
+            )
 
     def prepare(self, *, private: bool) -> None:
         """Create repository and branch where they are not there yet.
@@ -110,7 +115,7 @@ class Hub:
         """
         chosen = private or None  # None: as the organisation has set it; what is there already keeps what it is
         self._ask(
-            lambda: self.api.create_repo(self.repo_id, repo_type=DATASET, private=chosen, exist_ok=True),
+            lambda: self.api.create_repo(self.repo_id, repo_type=self.kind, private=chosen, exist_ok=True),
             waits=WAITS[:2],
         )
         if private and self._info(constants.DEFAULT_REVISION).private is False:
@@ -120,14 +125,14 @@ class Hub:
             )
         if self.branch != constants.DEFAULT_REVISION:
             self._ask(
-                lambda: self.api.create_branch(self.repo_id, repo_type=DATASET, branch=self.branch, exist_ok=True)
+                lambda: self.api.create_branch(self.repo_id, repo_type=self.kind, branch=self.branch, exist_ok=True)
             )
 
     def check_card(self, card: str) -> None:
         """Let the Hub judge a card's front matter, before anything is sent; raises HubError with what it says."""
 
         def judge() -> None:
-            url, given = f"{self.api.endpoint}/api/validate-yaml", {"content": card, "repoType": DATASET}
+            url, given = f"{self.api.endpoint}/api/validate-yaml", {"content": card, "repoType": self.kind}
             hf_raise_for_status(get_session().post(url, json=given, headers=build_hf_headers()))
 
         self._ask(judge)
@@ -143,7 +148,7 @@ class Hub:
         with tempfile.TemporaryDirectory() as folder:
             found = self._ask(
                 lambda: self.api.hf_hub_download(
-                    self.repo_id, path, repo_type=DATASET, revision=self.branch, local_dir=folder
+                    self.repo_id, path, repo_type=self.kind, revision=self.branch, local_dir=folder
                 )
             )
             try:
@@ -167,7 +172,7 @@ class Hub:
             Interrupted: Ctrl-C; says what is on the Hub.
         """
         operations: dict[str, CommitOperationAdd] = {}
-        sent = Sent(f"{self.api.endpoint}/datasets/{self.repo_id}")
+        sent = Sent(f"{self.api.endpoint}/{'datasets/' if self.kind == 'dataset' else ''}{self.repo_id}")
         try:
             first = self._changes(files, sent)
             if not first:
@@ -194,23 +199,25 @@ class Hub:
 
         def move() -> bool:
             head = self._info(self.branch).sha
-            refs = self.api.list_repo_refs(self.repo_id, repo_type=DATASET)
+            refs = self.api.list_repo_refs(self.repo_id, repo_type=self.kind)
             there = {ref.name: ref.target_commit for ref in refs.tags}
             if there.get(name) == head:
                 return False
             if name in there:
-                self.api.delete_tag(self.repo_id, repo_type=DATASET, tag=name)
-            self.api.create_tag(self.repo_id, repo_type=DATASET, tag=name, revision=self.branch, exist_ok=True)
+                self.api.delete_tag(self.repo_id, repo_type=self.kind, tag=name)
+            self.api.create_tag(self.repo_id, repo_type=self.kind, tag=name, revision=self.branch, exist_ok=True)
             return True
 
         return bool(self._ask(move))
 
     def _info(self, revision: str) -> Any:
-        return self._ask(lambda: self.api.dataset_info(self.repo_id, revision=revision))
+        return self._ask(lambda: self.api.repo_info(self.repo_id, revision=revision, repo_type=self.kind))
 
     def _tree(self) -> dict[str, RepoFile]:
         found = self._ask(
-            lambda: list(self.api.list_repo_tree(self.repo_id, repo_type=DATASET, revision=self.branch, recursive=True))
+            lambda: list(
+                self.api.list_repo_tree(self.repo_id, repo_type=self.kind, revision=self.branch, recursive=True)
+            )
         )
         return {f.path: f for f in found if isinstance(f, RepoFile)}
 
@@ -229,7 +236,7 @@ class Hub:
             )
             kind.append(path)
             sent.size += 0 if kind is sent.same else size
-        sent.removed = [p for p in sorted(there) if p.startswith(MANAGED) and p not in files]
+        sent.removed = [p for p in sorted(there) if p.startswith(MANAGED[self.kind]) and p not in files]
         changes: dict[str, Content | None] = {p: files[p] for p in [*sent.new, *sent.changed]}
         return changes | dict.fromkeys(sent.removed)
 
@@ -273,7 +280,7 @@ class Hub:
             self.repo_id,
             steps,
             commit_message=message,
-            repo_type=DATASET,
+            repo_type=self.kind,
             revision=self.branch,
             parent_commit=parent,
         )
@@ -281,7 +288,7 @@ class Hub:
     def _store(self, additions: list[CommitOperationAdd]) -> None:
         self._ask(
             lambda: self.api.preupload_lfs_files(
-                self.repo_id, additions, repo_type=DATASET, revision=self.branch, free_memory=False
+                self.repo_id, additions, repo_type=self.kind, revision=self.branch, free_memory=False
             )
         )
 
@@ -294,10 +301,10 @@ class Hub:
             except (CQNError, KeyboardInterrupt):
                 raise
             except Exception as error:  # the Hub's client, its transport and its encoder raise kinds of their own
-                cause = _cause(error)
-                reason = _passing(cause)
+                behind = cause(error)
+                reason = passing(behind)
                 if reason is None or wait is None:
-                    raise self._explained(cause) from error
+                    raise self._explained(behind) from error
                 note(f"{reason}; trying again in {wait:g} s.")
                 _wait(wait)
         raise AssertionError
@@ -307,15 +314,15 @@ class Hub:
             return DataError(f"{error.filename} cannot be read: {error.strerror}.")
         push = f"push again: {self.again}"
         if isinstance(error, HfHubHTTPError):
-            return HubError(f"{self._refused(error.response.status_code, _said(error))} {push}")
+            return HubError(f"{self._refused(error.response.status_code, said(error))} {push}")
         if isinstance(error, OfflineModeIsEnabled):
             return HubError(f"HF_HUB_OFFLINE is set, which forbids any connection: unset it, then {push}")
         if isinstance(error, httpx.ConnectError | httpx.ConnectTimeout | httpx.ProxyError):
-            where = f"No connection to {self.api.endpoint} ({_said(error)})"
+            where = f"No connection to {self.api.endpoint} ({said(error)})"
             return HubError(f"{where}{self._state}. When there is one, {push}")
-        if _transport(error):
-            return HubError(f"The connection to the Hub broke off ({_said(error)}){self._state}. To go on, {push}")
-        return HubError(f"The Hub refuses: {_said(error)}{self._state}. When that is mended, {push}")
+        if transport(error):
+            return HubError(f"The connection to the Hub broke off ({said(error)}){self._state}. To go on, {push}")
+        return HubError(f"The Hub refuses: {said(error)}{self._state}. When that is mended, {push}")
 
     def _refused(self, status: int, text: str) -> str:
         """What an answer means and what to do before pushing again."""
@@ -337,34 +344,6 @@ class Hub:
         with contextlib.suppress(Exception):  # it only makes an error clearer
             return f", logged in as {self.api.whoami()['name']}"
         return ""
-
-
-def _cause(error: BaseException) -> BaseException:
-    """What is behind the client's 'Error while uploading'."""
-    return error.__cause__ if type(error) is RuntimeError and error.__cause__ is not None else error
-
-
-def _passing(error: BaseException) -> str | None:
-    """What happened, where another try may go better."""
-    if isinstance(error, HfHubHTTPError):
-        status = error.response.status_code
-        return f"The Hub answered {status}" if status in PASSING else None
-    return f"The connection failed ({_said(error)})" if _transport(error) else None
-
-
-def _transport(error: BaseException) -> bool:
-    """Whether the network failed; the Xet client has plain errors for that, and for a refusal (4xx) as well."""
-    if "client error" in str(error):
-        return False
-    plain = type(error) in (RuntimeError, OSError) and not getattr(error, "filename", None)
-    return plain or isinstance(error, httpx.TransportError | ConnectionError | TimeoutError)
-
-
-def _said(error: BaseException) -> str:
-    """One line without addresses, which may hold signatures."""
-    text = error.server_message if isinstance(error, HfHubHTTPError) and error.server_message else str(error)
-    words = [w for w in text.split() if "://" not in w]
-    return " ".join(words)[:200].rstrip(" .:;") or type(error).__name__
 
 
 def _operation(path: str, content: Content) -> CommitOperationAdd:

@@ -1,13 +1,13 @@
 """``cqn-data push``: a dataset and a card that tells its history, to the Hugging Face Hub."""
 
 import dataclasses
-import re
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .console import load_lerobot, note, result, table
+from .hub_options import HubTarget
 from .options import help_page, option, parse
 
 if TYPE_CHECKING:
@@ -28,47 +28,14 @@ Files of data/, meta/ and videos/ on the Hub that the folder does not have are r
 them. The tag of the format (v3.0), which LeRobot loads by default, moves along, but not with --branch.
 """
 README = "README.md"
-NAME = re.compile(r"[A-Za-z0-9](?:[\w.-]{0,94}[A-Za-z0-9])?", re.ASCII)
-LICENSE = re.compile(r"[a-z0-9][a-z0-9.-]*")
-BRANCH = re.compile(r"(?![/.-])(?!.*(?:\.\.|//|@\{))[\w./-]+(?<![/.])", re.ASCII)
 SHOWN = 40  # files named one by one
 
 
-@dataclasses.dataclass
-class PushConfig:
+@dataclasses.dataclass(kw_only=True)
+class PushConfig(HubTarget):
     """Settings of ``cqn-data push``."""
 
-    repo_id: str = option(help="Name on the Hub, as user/name.")
     root: str | None = option(None, help="Folder of the dataset; by default LeRobot's home and the repo_id.")
-    private: bool = option(False, help="Make a new repository private; refused where it is there already and public.")
-    license: str | None = option(None, help="Licence for the card; by default the card's own, else apache-2.0.")
-    tags: list[str] = dataclasses.field(
-        default_factory=list,
-        metadata={"help": "Tags for the card, e.g. '[ur5e, click]', besides LeRobot and cqn-data."},
-    )
-    branch: str | None = option(None, help="Branch to push to, made where it is missing; by default main.")
-    message: str | None = option(None, help="Message of the commit.")
-    dry_run: bool = option(False, help="Show the card and what would be uploaded; needs neither network nor login.")
-
-    def validate(self) -> None:
-        """Check forms; raises ConfigError naming the option, what was expected and what was found."""
-        from lerobot_cqn.errors import ConfigError
-
-        parts = self.repo_id.split("/")
-        if len(parts) != 2 or not all(NAME.fullmatch(p) and "--" not in p and ".." not in p for p in parts):
-            raise ConfigError(
-                "Expected --repo_id=user/name of letters, digits, '-', '_' and '.' (not doubled, not at the ends), got"
-                f" '{self.repo_id}'."
-            )
-        if self.license is not None and not LICENSE.fullmatch(self.license):
-            raise ConfigError(f"Expected --license as on the Hub, e.g. apache-2.0 or cc-by-4.0, got '{self.license}'.")
-        for tag in self.tags:
-            if not tag.strip() or len(tag) > 100 or not tag.isprintable():
-                raise ConfigError(f"Expected --tags of 1 to 100 printable characters each, got {tag!r}.")
-        if self.branch is not None and not BRANCH.fullmatch(self.branch):
-            raise ConfigError(f"Expected --branch as git allows it, e.g. filtered, got '{self.branch}'.")
-        if self.message is not None and not self.message.strip():
-            raise ConfigError("Expected --message with some text; leave it out for the usual one.")
 
 
 def help() -> str:
@@ -88,7 +55,7 @@ def main(args: list[str]) -> None:
     config = parse(PushConfig, args)
     config.validate()
     if not config.dry_run:
-        from .hub import refuse_to_start
+        from .hub_errors import refuse_to_start
 
         refuse_to_start()
     load_lerobot()
@@ -149,21 +116,22 @@ def _merged_card(hub: "Hub", facts: "Facts", labels: "Labels", own: str | None) 
     """The card from what lies in the folder or else on the Hub; says what it does to a card of a person."""
     from lerobot_cqn.errors import DataError
 
-    from .card import START, own_text, write_card
+    from .card import TOOL, write_card
+    from .readme import Readme, start_mark
 
     there = hub.text(README)
     if own is None:
-        if there is not None and START not in there:
+        if there is not None and start_mark(TOOL) not in there:
             note("The README.md on the Hub keeps its text; what the dataset is and its history are added below it.")
         try:
             return write_card(facts, labels, there)
         except DataError as error:
             raise DataError(f"On the Hub: {error} Mend it there, or put a README.md into the folder.") from error
-    if START not in own:
+    if start_mark(TOOL) not in own:
         note("README.md keeps its text; what the dataset is and its history are added below it, on the Hub only.")
     card = write_card(facts, labels, own)
     try:
-        replaced = there is not None and own_text(there) != own_text(card)
+        replaced = there is not None and Readme.read(there, TOOL).own_text != Readme.read(card, TOOL).own_text
     except DataError:  # it was not readable
         replaced = True
     if replaced:

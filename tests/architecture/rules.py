@@ -20,7 +20,7 @@ INSTALLED_AS = {
 ROOM_MAY_USE: dict[str, tuple[str, ...]] = {
     "lerobot_cqn": (),
     "lerobot_cqn._plugin": ("train.envs", "train.sim_arm"),
-    "datasets_tools": ("lerobot_cqn.schema", "lerobot_cqn.errors"),
+    "datasets_tools": ("lerobot_cqn.schema", "lerobot_cqn.errors", "lerobot_cqn.story"),
     "train": ("lerobot_cqn", "datasets_tools"),
 }
 
@@ -52,6 +52,7 @@ SIBLINGS: dict[str, set[str]] = {
     "base_policy": _BASE | _SETTINGS | {"model"},
     "joint_goals": _BASE,
     "fit_pictures": _BASE,
+    "story": _BASE,
     "processors": _BASE | _SETTINGS | {"joint_goals", "fit_pictures"},
     "configuration_cqn": _SETTINGS,
     "processor_cqn": {"configuration_cqn", "processors"},

@@ -13,13 +13,15 @@ import yaml
 from huggingface_hub import HfApi, close_session
 
 from cqn_data import hub as hub_module
-from cqn_data.card import END, START
+from cqn_data.card import TOOL
 from cqn_data.cli import main
+from cqn_data.readme import end_mark, start_mark
 
 from ..hub_server import TOKEN, HubServer
 from ..toy_datasets import CAMERA, make_dataset
 
 REPO = "user/toy"
+START, END = start_mark(TOOL), end_mark(TOOL)
 DATA = "data/chunk-000/file-000.parquet"
 RECIPE = "steps: [drop: {episodes: [1], reason: clumsy}, label: {all: true}, bounds: {margin: 0.5}]"
 

@@ -4,14 +4,17 @@ import numpy as np
 import pytest
 import yaml
 
-from cqn_data.card import END, START, Facts, Labels, look, own_text, write_card
+from cqn_data.card import TOOL, Facts, Labels, look, write_card
 from cqn_data.job import Job, run_job
+from cqn_data.readme import Readme, end_mark, start_mark
 from cqn_data.run import load_recipe
 from cqn_data.source import open_source
-from cqn_data.story import tell, told
 from lerobot_cqn.errors import DataError
+from lerobot_cqn.story import tell, told
 
 from ..toy_datasets import CAMERA, make_dataset
+
+START, END = start_mark(TOOL), end_mark(TOOL)
 
 RECIPE = """
 steps:
@@ -137,7 +140,7 @@ def test_names_and_sentences_of_people_break_neither_table_nor_marks():
     card = write_card(changed, LABELS)
     assert (card.count(START), card.count(END), card.count("<script>")) == (1, 1, 2)  # two between backticks
     assert write_card(changed, LABELS, card) == card
-    assert own_text(card) == "# toy"
+    assert Readme.read(card, TOOL).own_text == "# toy"
     rows = [line for line in card.splitlines() if line.startswith("| a")]
     assert len(rows) == 2
     assert all("a\\|b &lt;!--" in row for row in rows)
@@ -157,7 +160,7 @@ def test_a_card_is_written_anew_only_between_the_marks():
     assert second.count("## History") == 1
     assert front_matter(second)["license"] == "cc0-1.0"
     assert write_card(facts(robot="other"), LABELS, second) == second
-    assert own_text(second) == "New intro\n\n---\n\nA rule above.\nThanks."
+    assert Readme.read(second, TOOL).own_text == "New intro\n\n---\n\nA rule above.\nThanks."
 
 
 @pytest.mark.parametrize("base", ["---\na: [\n---\n", "---\njust text\n---\n", "---\nno: end\n"])
