@@ -8,7 +8,7 @@ export HF_HUB_OFFLINE ?= 1
 test slow: export OMP_NUM_THREADS = 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-arm test slow check format setup pins clean distclean
+.PHONY: help demo demo-arm test slow check docs format setup pins release-check compatibility clean distclean
 
 help: ## show the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -31,6 +31,11 @@ check: ## lint, formatting, types, import rules
 	@$(RUN) .venv/bin/python -m mypy
 	@$(RUN) .venv/bin/python -m pytest tests/architecture $(ARGS)
 
+docs: ## the documentation as a site, in build/site; renews docs/configuration.md
+	@$(RUN) .venv/bin/python docs/reference.py
+	@$(RUN) .venv/bin/python -m sphinx -q -W --keep-going -c docs -d build/doctrees . build/site
+	@echo "build/site/index.html"
+
 format: ## sort imports, fix what can be fixed, format
 	@$(RUN) .venv/bin/python -m ruff check --fix .
 	@$(RUN) .venv/bin/python -m ruff format .
@@ -40,6 +45,12 @@ setup: ## only make .venv ready
 
 pins: ## refresh constraints.txt to the newest versions that fit pyproject.toml
 	@$(RUN) bash .ci/pins.sh
+
+release-check: ## wheel and sdist in empty environments, each extra, lowest versions (downloads, 15 minutes)
+	@$(RUN) .venv/bin/python -m tests.release.check $(ARGS)
+
+compatibility: ## run every command of LeRobot with the policy, write docs/compatibility.md (downloads, 10 minutes)
+	@$(RUN) .venv/bin/python -m tests.release.compatibility $(ARGS)
 
 clean: ## remove caches and build leftovers
 	rm -rf build dist ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -35,7 +35,13 @@ Merging and splitting with lerobot-edit-dataset does so, too.
 """
 
     quantile: float = option(0.0, help="Share of the steps left out at either end of each dimension, 0 to below 0.5.")
-    margin: float = option(0.0, help="Share of the range added at either end; 0.2 is like the authors' code.")
+    margin: float = option(
+        0.0,
+        help=(
+            "Share of the range added at either end; 0.2 is like the authors' code. Where some actions are "
+            "differences, only of these: the ends of an absolute one (a gripper) are the robot's own."
+        ),
+    )
 
     def validate(self) -> None:
         """Check ranges; raises ConfigError naming the option, the range and the value."""
@@ -110,7 +116,7 @@ def quantile_bounds(view: View, episodes: Sequence[int], quantile: float, margin
         view: the actions.
         episodes: at least one.
         quantile: share left out at either end; exact to 1/65536 of the range.
-        margin: share of what is left, added at either end.
+        margin: share of what is left, added at either end; where some dimensions are differences, only of these.
     """
     low, high = extremes(view, episodes)
     if quantile > 0:
@@ -124,6 +130,8 @@ def quantile_bounds(view: View, episodes: Sequence[int], quantile: float, margin
         first, last = (shares > quantile).argmax(axis=1), (shares >= 1 - quantile).argmax(axis=1) + 1
         low, high = low + width * first / BINS, np.minimum(high, low + width * last / BINS)
     spread = margin * (high - low)
+    if view.deltas is not None:
+        spread[[i for i in range(len(spread)) if i not in view.deltas.action_dims]] = 0.0
     return Bounds(low - spread, high + spread)
 
 

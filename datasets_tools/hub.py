@@ -26,9 +26,9 @@ from huggingface_hub.utils import build_hf_headers, hf_raise_for_status  # type:
 from rich.console import Console
 
 from lerobot_cqn.errors import CQNError, DataError
+from lerobot_cqn.hub_errors import PASSING, HubError, cause, passing, said, transport
 
 from .console import Interrupted, note, progress
-from .hub_errors import PASSING, HubError, cause, passing, said, transport
 from .hub_files import Content, Hashes, batches, size_of
 
 __all__ = ["MANAGED", "Hub", "HubError", "Sent"]

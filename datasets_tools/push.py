@@ -2,11 +2,10 @@
 
 import dataclasses
 import shlex
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .console import load_lerobot, note, result, table
+from .console import load_lerobot, note, result
 from .hub_options import HubTarget
 from .options import help_page, option, parse
 
@@ -28,7 +27,6 @@ Files of data/, meta/ and videos/ on the Hub that the folder does not have are r
 them. The tag of the format (v3.0), which LeRobot loads by default, moves along, but not with --branch.
 """
 README = "README.md"
-SHOWN = 40  # files named one by one
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -55,11 +53,12 @@ def main(args: list[str]) -> None:
     config = parse(PushConfig, args)
     config.validate()
     if not config.dry_run:
-        from .hub_errors import refuse_to_start
+        from lerobot_cqn.hub_errors import refuse_to_start
 
         refuse_to_start()
     load_lerobot()
     from .card import Labels, look, write_card
+    from .hub_report import megabytes, show_dry
     from .source import open_source
 
     source = open_source(config.repo_id, config.root)
@@ -72,7 +71,7 @@ def main(args: list[str]) -> None:
     _warn_of_folders(source.root)
     card = write_card(facts, labels, own)
     if config.dry_run:
-        _show(files, card, config.repo_id)
+        show_dry({**files, README: card.encode()}, card, config.repo_id)
         return
     from .hub import Hub
 
@@ -81,7 +80,7 @@ def main(args: list[str]) -> None:
     card = _merged_card(hub, facts, labels, own)
     hub.check_card(card)
     size = sum(path.stat().st_size for path in files.values())
-    note(f"Sending {len(files)} files, {_megabytes(size)}, and the card to {config.repo_id} ({hub.branch}).")
+    note(f"Sending {len(files)} files, {megabytes(size)}, and the card to {config.repo_id} ({hub.branch}).")
     episodes = f"{len(facts.lengths)} episodes, {sum(facts.lengths)} steps"
     sent = hub.send({**files, README: card.encode()}, config.message or f"cqn-data push: {episodes}")
     version = str(source.meta.info.codebase_version)
@@ -139,22 +138,6 @@ def _merged_card(hub: "Hub", facts: "Facts", labels: "Labels", own: str | None) 
     return card
 
 
-def _show(files: Mapping[str, Path], card: str, repo_id: str) -> None:
-    result(card)
-    sizes = {path: file.stat().st_size for path, file in files.items()} | {README: len(card.encode())}
-    shown: dict[str, list[int]] = {}
-    for path, size in sorted(sizes.items()):
-        shown.setdefault(path if len(sizes) <= SHOWN else _folder(path), []).append(size)
-    rows = [[name, str(len(all_)), f"{sum(all_):,}"] for name, all_ in shown.items()]
-    table(["file" if len(sizes) <= SHOWN else "folder", "files", "bytes"], rows,
-          ["total", str(len(sizes)), f"{sum(sizes.values()):,}"])  # fmt: skip
-    result(f"Dry run: nothing was sent to {repo_id}.")
-
-
-def _folder(path: str) -> str:
-    return "/".join(path.split("/")[:-1][:2]) + "/" if "/" in path else path
-
-
 def _warn_of_folders(root: Path) -> None:
     """Say when the history that goes along names folders of this machine."""
     from .target import HISTORY
@@ -169,20 +152,12 @@ def _warn_of_folders(root: Path) -> None:
 
 
 def _report(sent: "Sent", repo_id: str, branch: str | None, version: str) -> None:
-    if sent.removed:
-        some = ", ".join(sent.removed[:3]) + (", …" if len(sent.removed) > 3 else "")
-        note(f"Removed {len(sent.removed)} files that the dataset no longer has: {some}; the history keeps them.")
-    counts = f"{len(sent.new)} new and {len(sent.changed)} changed files, {_megabytes(sent.size)}"
-    if not (sent.new or sent.changed or sent.removed):
-        counts = "nothing new"
-    result(f"Pushed {repo_id}: {counts}; {len(sent.same)} were there already.")
+    from .hub_report import show_sent
+
+    show_sent(sent, repo_id, "dataset")
     if branch is not None:
         result(f'Load it with LeRobotDataset("{repo_id}", revision="{branch}"). The tag {version} was left alone.')
     else:
         moved = f"The tag {version} names this state" + ("" if sent.tagged else " already")
         result(f'{moved}: LeRobotDataset("{repo_id}") loads it.')
     result(sent.url)
-
-
-def _megabytes(size: int) -> str:
-    return f"{size / 1e6:.1f} MB"

@@ -143,6 +143,7 @@ class RLConfig(PreTrainedConfig):
         path = save_directory / "config.json"
         saved: dict[str, Any] = json.loads(path.read_text())
         saved.update(draccus.encode(asdict(self.settings)))
+        saved.update(push_to_hub=False, repo_id=None)  # whoever continues from it must not push over its owner's
         path.write_text(json.dumps(saved, indent=4))
 
 

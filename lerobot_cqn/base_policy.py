@@ -1,22 +1,28 @@
 """RLPolicy: the thin surface LeRobot's commands talk to, whatever the method."""
 
 import logging
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any, ClassVar
 
 import torch
+from huggingface_hub import ModelCard, constants
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
 from .base_config import RLConfig
 from .errors import ConfigError, DataError
+from .hub_errors import HubError, cause, passing, refuse_to_start, said
 from .model import Model
+from .model_card import ModelFacts, as_readme, commands, data_facts
 from .schema import ACTION, NEXT_REWARD, Batch, Observation
 
 __all__ = ["RLPolicy"]
 
 logger = logging.getLogger(__name__)
+
+PUSH_WAITS = (2.0, 8.0)  # seconds before each further try
 
 
 class RLPolicy(PreTrainedPolicy):
@@ -37,6 +43,8 @@ class RLPolicy(PreTrainedPolicy):
 
     def __init__(self, config: RLConfig, dataset_stats: Any = None, dataset_meta: Any = None, **_: Any) -> None:
         super().__init__(config)
+        if dataset_meta is not None and config.push_to_hub:  # at the end of a training that begins now
+            refuse_to_start()
         config.validate_features()
         shapes = {key: feature.shape for key, feature in sorted(config.image_features.items())}
         self.view_keys = tuple(shapes)
@@ -189,3 +197,43 @@ class RLPolicy(PreTrainedPolicy):
         value = batch[key]
         # With a single offset the loader drops the time axis of videos and vectors.
         return value if value.ndim == len((self.config.input_features or {})[key].shape) + 2 else value[:, None]
+
+    # -- the Hub -----------------------------------------------------------------------------------------------
+
+    def generate_model_card(
+        self, dataset_repo_id: str, model_type: str, license: str | None, tags: list[str] | None, cfg: Any = None,
+        dataset_meta: Any = None,
+    ) -> ModelCard:  # fmt: skip
+        """The card that `lerobot-train` pushes; `model_type` is the configuration's own."""
+        env, repo_id = getattr(cfg, "env", None), self.config.repo_id or f"user/{model_type}"
+        local = getattr(getattr(cfg, "dataset", None), "root", None) is not None
+        data = data_facts(dataset_meta, dataset_repo_id, public=not local) if dataset_meta is not None else None
+        rows = {"Trained with": "lerobot-train, offline"}
+        if cfg is not None:
+            rows |= {"Updates": str(cfg.steps), "Batch size": str(cfg.batch_size), "Seed": str(cfg.seed)}
+        tasks = list(dataset_meta.tasks.index) if dataset_meta is not None else []
+        facts = ModelFacts(
+            repo_id, self.config, str(tasks[0]) if tasks else dataset_repo_id, rows,
+            commands(repo_id, env=env, dataset=dataset_repo_id), license, tags or (), data,
+        )  # fmt: skip
+        return ModelCard(as_readme(facts, constants.ENDPOINT))
+
+    def push_model_to_hub(self, cfg: Any, *args: Any, **kwargs: Any) -> None:
+        """Push as LeRobot does, again where that may help.
+
+        Raises HubError, which names the command that pushes later: the run is on disk.
+        """
+        for wait in (*PUSH_WAITS, None):
+            try:
+                super().push_model_to_hub(cfg, *args, **kwargs)
+                return
+            except Exception as error:  # the Hub's client and its transport raise kinds of their own
+                reason = passing(cause(error))
+                if reason is None or wait is None:
+                    raise HubError(
+                        f"{self.config.repo_id} could not be pushed ({said(cause(error))}). The run is safe in "
+                        f"{cfg.output_dir}; push it when that is mended: cqn-push --run={cfg.output_dir} "
+                        f"--repo_id={self.config.repo_id}"
+                    ) from error
+                logger.warning("%s; trying again in %g s.", reason, wait)
+                time.sleep(wait)

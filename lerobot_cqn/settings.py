@@ -21,33 +21,33 @@ class CommonSettings:
     frame_stack: int = 8  # S; joints and environment state are stacked like the images
     shift_pixels: int = 4  # random shift, 0 is off
     brightness: float = 0.0  # factor drawn from 1 +- this
-    contrast: float = 0.0
+    contrast: float = 0.0  # likewise, around the picture's mean
     state_bound: float = 2.0  # normalised state is cut here: demonstrations span [-1, 1]
     # Action
     action_margin: float = 0.0  # widens the action bounds by this share of the range, on each side
     # Networks
-    encoder_channels: tuple[int, ...] = (32, 64, 128, 256)
-    feature_dim: int = 64
-    hidden_dim: int = 512
+    encoder_channels: tuple[int, ...] = (32, 64, 128, 256)  # of each convolution, stride 2; one encoder a camera
+    feature_dim: int = 64  # size of the projections of pictures and of numbers, before the trunk
+    hidden_dim: int = 512  # width of the trunk
     # Value distribution
     distributional: bool = True  # False: scalar Q and squared error
-    atoms: int = 51  # A
-    v_min: float = -1.0
-    v_max: float = 1.0
+    atoms: int = 51  # A, atoms of the value distribution
+    v_min: float = -1.0  # lowest value that the distribution can hold
+    v_max: float = 1.0  # highest value that the distribution can hold
     # Losses
     rl_loss_scale: float = 0.1  # 0 leaves imitation alone
-    bc_loss_scale: float = 1.0
+    bc_loss_scale: float = 1.0  # weight of the imitation losses; 0 leaves RL alone
     discount: float = 0.99  # the authors' implementation; the paper gives no number
-    n_step: int = 3
+    n_step: int = 3  # n, steps of reward before the value of what follows
     # Optimisation
-    lr: float = 5e-5
-    weight_decay: float = 0.1
-    tau: float = 0.02
+    lr: float = 5e-5  # learning rate of AdamW
+    weight_decay: float = 0.1  # of AdamW
+    tau: float = 0.02  # share by which the target network follows in each update
     # Acting
-    exploration_noise: float = 0.01
+    exploration_noise: float = 0.01  # standard deviation of the noise on actions in [-1, 1], in training episodes only
     # Speed
-    channels_last: bool = True
-    bf16: bool = False
+    channels_last: bool = True  # memory layout of pictures; the same numbers, faster convolutions
+    bf16: bool = False  # networks in bfloat16, losses in float32
 
     def __post_init__(self) -> None:
         """Check ranges; every message names the field, the value found and what is allowed."""
@@ -89,15 +89,15 @@ class CQNSettings(CommonSettings):
     """Hyperparameters of CQN. Raises ConfigError when a value is out of its range."""
 
     # Discretisation
-    levels: int = 3  # L
-    bins: int = 5  # N
+    levels: int = 3  # L, levels of zooming in
+    bins: int = 5  # N, bins of each level
     # Losses; rl_loss_scale=0 gives the paper's CBC baseline, distributional=False also margin-only imitation
     bc_dominance: bool = True  # False: margin only
     bc_margin: float = 0.01  # the authors' implementation; the paper gives no number
     centralized_critic: bool = False  # True: one value for the whole action, the mean over D (an ablation of the paper)
     next_action_from: str = "online"  # the authors' double-Q style; "target" is equation 2 as written
     # Acting
-    act_with: str = "target"
+    act_with: str = "target"  # critic that acts: the target or the online one
     random_bin_below: float = 1e-4  # exploring only: a spread of Q under this picks a random bin; 0 is off
 
     def __post_init__(self) -> None:

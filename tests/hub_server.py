@@ -229,7 +229,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _create(self) -> None:
         given = self._json()
-        kind, owner = f"{given['type']}s", given["organization"] or USER
+        kind, owner = f"{given.get('type') or 'model'}s", given.get("organization") or USER
         repo_id = f"{owner}/{given['name']}"
         self._may_write(repo_id)
         url = f"{self.hub.url}/{'' if kind == 'models' else kind + '/'}{repo_id}"

@@ -45,6 +45,7 @@ from .interfaces import Environment, Interrupted, Scenes
 from .look import draw_batch, warnings_about
 from .metrics import Log, Metrics, start_tensorboard, start_wandb
 from .online import Monitor, Nobody, Trainer
+from .push import PushConfig, check_account, push
 from .replay import Episode, Replay
 
 __all__ = ["main"]
@@ -57,13 +58,9 @@ def build(
 
     stack: takes up what must be closed again.
     """
-    config.validate()
-    assert isinstance(config.policy, RLConfig) and config.output_dir is not None  # noqa: S101, PT018  # just validated
+    check(config, monitor.message)
+    assert isinstance(config.policy, RLConfig) and config.output_dir is not None  # noqa: S101, PT018  # just checked
     checkpoint = last_checkpoint(config.output_dir) if config.resume else None
-    if not config.resume and config.output_dir.exists() and any(config.output_dir.iterdir()):
-        raise OutputExistsError(
-            f"{config.output_dir} exists and is not empty: give another --output_dir, or --resume=true to continue."
-        )
     if config.threads:
         torch.set_num_threads(config.threads)
     rng = seed_everything(config.seed)
@@ -120,6 +117,18 @@ def build(
         config, agent, learner, env, scenes, replay, metrics, shown, rng, counters, save_checkpoint, should_stop,
         finished_since=finished, person=Nobody() if operated is None else operated.session,
     )  # fmt: skip
+
+
+def check(config: RunConfig, say: Callable[[str], None]) -> None:
+    """What can be checked before anything is made. Raises CQNError; warnings are said."""
+    config.validate()
+    assert config.policy is not None and config.output_dir is not None  # noqa: S101, PT018  # just validated
+    if not config.resume and config.output_dir.exists() and any(config.output_dir.iterdir()):
+        raise OutputExistsError(
+            f"{config.output_dir} exists and is not empty: give another --output_dir, or --resume=true to continue."
+        )
+    if config.policy.push_to_hub and (warning := check_account(str(config.policy.repo_id))):
+        say(f"Warning: {warning}")
 
 
 def also_to(config: RunConfig, operated: Operated | None) -> list[Log]:
@@ -284,8 +293,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     try:
         return run(parse(arguments))
-    except KeyboardInterrupt:
-        print("cqn-train: stopped at once; the last checkpoint is untouched.", file=sys.stderr)  # noqa: T201
+    except KeyboardInterrupt as error:  # of a push it says what is on the Hub
+        print(f"cqn-train: {error or 'stopped at once; the last checkpoint is untouched.'}", file=sys.stderr)  # noqa: T201
         return 130
     except (CQNError, OSError) as error:
         if debug:
@@ -305,6 +314,14 @@ def run(config: RunConfig) -> int:
             monitor.message(f"Stopped. Continue with: cqn-train --resume=true --output_dir={config.output_dir}")
             return 130
         monitor.message(f"Policy: {config.output_dir}/checkpoints/last/pretrained_model")
+    policy = config.policy
+    if policy is not None and policy.push_to_hub:
+        push(
+            PushConfig(
+                run=str(config.output_dir), repo_id=str(policy.repo_id), private=bool(policy.private),
+                license=policy.license, tags=list(policy.tags or ()),
+            )
+        )  # fmt: skip
     return 0
 
 

@@ -9,6 +9,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.robots.config import RobotConfig
 from lerobot.teleoperators.config import TeleoperatorConfig
 
+from cqn_data.hub_options import check_repo_id
 from lerobot_cqn.base_config import RLConfig
 from lerobot_cqn.errors import ConfigError, one_of
 
@@ -89,9 +90,9 @@ class PageSettings:
 class WandBSettings:
     """Weights & Biases, off by default."""
 
-    enable: bool = False
-    project: str = "lerobot"
-    mode: str | None = None
+    enable: bool = False  # log to Weights & Biases (extra `wandb`)
+    project: str = "lerobot"  # its project
+    mode: str | None = None  # online, offline or disabled; None: its own default
 
 
 @dataclass
@@ -142,6 +143,8 @@ class RunConfig:
             )
         if self.output_dir is None:
             raise ConfigError("No output directory: give --output_dir=DIR.")
+        if self.policy.push_to_hub:
+            check_repo_id(self.policy.repo_id or "", "--policy.repo_id")
         self._validate_arm()
         recipe = self.recipe
         learns_from_data = recipe.demo_batch_size > 0 or self.offline_updates > 0

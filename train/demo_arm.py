@@ -33,7 +33,7 @@ class ArmDemoConfig:
 
     output_dir: Path = Path("outputs/demo-arm")
     demonstrations: int = 20
-    offline_updates: int = 80
+    offline_updates: int = 60
     steps: int = 1800
     eval_episodes: int = 40
     episode_s: float = 6.5  # simulated

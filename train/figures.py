@@ -10,7 +10,7 @@ from PIL import Image
 
 from lerobot_cqn.errors import ConfigError
 
-__all__ = ["animation", "arm_session", "curves", "dropped_steps", "film_strip", "poster"]
+__all__ = ["animation", "arm_session", "curves", "dropped_steps", "film_strip", "learning_curve", "poster"]
 
 COLOURS = {"filtered": "#1f77b4", "unfiltered": "#d95f02"}
 KEPT, DROPPED = "#1f77b4", "#d9d9d9"
@@ -73,6 +73,24 @@ def arm_session(episodes: Rows, evaluations: Rows) -> bytes:
     axes.errorbar(place, rate, yerr=spread, fmt="D", color="black", markersize=5, capsize=3, label=text)
     axes.set(xlabel="episodes online", ylabel="success", ylim=(-0.05, 1.07))
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False, fontsize=8)
+    return _png(figure)
+
+
+def learning_curve(episodes: Rows, evaluations: Rows) -> bytes:
+    """A run: evaluations with their 95 % intervals, and the running mean of 10 training episodes."""
+    figure, axes = _pyplot().subplots(figsize=(7.2, 3.2))
+    if episodes:
+        success = np.array([float(row["success"]) for row in episodes])
+        mean = [success[max(0, i - 9) : i + 1].mean() for i in range(len(success))]
+        text = "training episodes, running mean of 10"
+        axes.plot([int(row["env_steps"]) for row in episodes], mean, color="0.7", linewidth=1, label=text)
+    steps, rate = [int(row["env_steps"]) for row in evaluations], [float(row["success_rate"]) for row in evaluations]
+    low, high = [float(row["ci_low"]) for row in evaluations], [float(row["ci_high"]) for row in evaluations]
+    axes.plot(steps, rate, marker="o", markersize=4, color=KEPT, label="evaluation, with its 95 % interval")
+    spread = [np.subtract(rate, low), np.subtract(high, rate)]
+    axes.errorbar(steps, rate, yerr=spread, fmt="none", ecolor=KEPT, alpha=0.5, capsize=3)
+    axes.set(xlabel="control steps online (0 is after offline training)", ylabel="success rate", ylim=(-0.03, 1.04))
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False, fontsize=9)
     return _png(figure)
 
 

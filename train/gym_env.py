@@ -23,7 +23,10 @@ NEW_EPISODE = {"lerobot_new_rollout": True}  # as lerobot-eval marks a reset
 
 
 class _Gym:
-    """Environments made by LeRobot's factory, with LeRobot's observation names and processors."""
+    """Environments made by LeRobot's factory, with LeRobot's observation names and processors.
+
+    max_steps: control steps before an episode is cut off.
+    """
 
     def __init__(
         self, config: EnvConfig, policy_config: PreTrainedConfig, count: int = 1, *, apart: bool = False
@@ -36,6 +39,13 @@ class _Gym:
         if len(vectors) != 1:
             raise DataError(f"Expected one task, '{config.type}' made {len(vectors)}: name one with `--env.task=`.")
         self.vector = vectors[0]
+        try:
+            self.max_steps = int(self.vector.get_attr("_max_episode_steps")[0])
+        except (AttributeError, TypeError) as error:
+            raise ConfigError(
+                f"The environment '{config.type}' says not when an episode is cut off: register it with "
+                "max_episode_steps (gymnasium.register)."
+            ) from error
         self._pre, self._post = make_env_pre_post_processors(config, policy_config)
 
     def close(self) -> None:
@@ -62,11 +72,6 @@ class GymEnvironment(_Gym):
         super().__init__(config, policy_config, 1, apart=False)
         self.env: gym.Env[Any, Any] = self.vector.envs[0]
         self._fps = int(config.fps)
-
-    @property
-    def max_steps(self) -> int:
-        """Control steps before an episode is cut off."""
-        return int(self.env.get_wrapper_attr("_max_episode_steps"))
 
     @property
     def fps(self) -> int:
@@ -105,11 +110,6 @@ class GymScenes(_Gym):
     def __init__(self, config: EnvConfig, policy_config: PreTrainedConfig, count: int, *, apart: bool = False) -> None:
         super().__init__(config, policy_config, count, apart=apart)
         self.count = count
-
-    @property
-    def max_steps(self) -> int:
-        """Control steps before an episode is cut off."""
-        return int(self.vector.get_attr("_max_episode_steps")[0])
 
     def reset(self, seeds: Sequence[int]) -> Frame:
         """Start an episode in each; rows [K, ...]."""

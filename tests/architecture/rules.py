@@ -20,7 +20,7 @@ INSTALLED_AS = {
 ROOM_MAY_USE: dict[str, tuple[str, ...]] = {
     "lerobot_cqn": (),
     "lerobot_cqn._plugin": ("train.envs", "train.sim_arm"),
-    "datasets_tools": ("lerobot_cqn.schema", "lerobot_cqn.errors", "lerobot_cqn.story"),
+    "datasets_tools": ("lerobot_cqn.schema", "lerobot_cqn.errors", "lerobot_cqn.hub_errors", "lerobot_cqn.story"),
     "train": ("lerobot_cqn", "datasets_tools"),
 }
 
@@ -49,10 +49,12 @@ SIBLINGS: dict[str, set[str]] = {
     "learner": _BASE | {"model"},
     # What LeRobot sees; the modules above know nothing of it.
     "base_config": _BASE | {"settings"},
-    "base_policy": _BASE | _SETTINGS | {"model"},
+    "base_policy": _BASE | _SETTINGS | {"model", "model_card", "hub_errors"},
     "joint_goals": _BASE,
     "fit_pictures": _BASE,
     "story": _BASE,
+    "hub_errors": _BASE,
+    "model_card": _BASE | _SETTINGS | {"joint_goals", "story"},
     "processors": _BASE | _SETTINGS | {"joint_goals", "fit_pictures"},
     "configuration_cqn": _SETTINGS,
     "processor_cqn": {"configuration_cqn", "processors"},

@@ -21,6 +21,7 @@ from lerobot.scripts import lerobot_eval
 from cqn_data.cli import main as cqn_data
 from cqn_train.cli import main as cqn_train
 from cqn_train.envs import AlohaSmallEnv, HilSimEnv, PushtSmallEnv
+from lerobot_cqn.errors import ConfigError
 
 from .conftest import TINY_POLICY
 
@@ -338,3 +339,18 @@ def test_an_installed_foreign_package_is_found_without_being_named(
     root = tmp_path / "data"
     data("record", *env, "--repo_id=local/demos", f"--root={root}", "--episodes=2", "--pause_share=0")
     assert evaluate(train(root, tmp_path / "run", *env), *env)["eval_s"] > 0
+
+
+def test_an_environment_without_a_time_limit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import gymnasium as gym
+
+    from cqn_train.arguments import parse
+    from cqn_train.gym_env import GymEnvironment
+
+    name = make_package(tmp_path / "lib", "endless", monkeypatch)
+    config = parse([f"--env.discover_packages_path={name}", "--env.type=endless", *TINY_POLICY])
+    monkeypatch.setattr(gym.spec(f"{name}/Point-v0"), "max_episode_steps", None)
+    assert config.env is not None
+    assert config.policy is not None
+    with pytest.raises(ConfigError, match="'endless' says not when an episode is cut off: register it with"):
+        GymEnvironment(config.env, config.policy)

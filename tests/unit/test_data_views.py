@@ -146,6 +146,16 @@ def test_bounds_leave_out_the_share_asked_for(parts, quantile):
     np.testing.assert_allclose(wide.high - wide.low, 2 * (found.high - found.low), atol=1e-9)
 
 
+@given(arrays(np.float32, (20, 3), elements=st.floats(-5, 5, width=32)))
+def test_a_margin_widens_differences_and_leaves_absolute_actions(values):
+    view = Memory(data={0: make_episode(np.zeros_like(values), values)}, kind=Deltas("state", (0, 2), (0, 2)))
+    found = quantile_bounds(view, [0], 0.0, margin=0.25)
+    low, high = values.min(axis=0).astype(np.float64), values.max(axis=0).astype(np.float64)
+    spread = 0.25 * (high - low) * [1, 0, 1]
+    np.testing.assert_allclose(found.low, low - spread)
+    np.testing.assert_allclose(found.high, high + spread)
+
+
 def test_bounds_end_where_steps_or_actions_change():
     @dataclasses.dataclass
     class Bounded(Memory):

@@ -13,9 +13,7 @@ class ArmSettings:
 
     fps: int | None = None  # control steps a second; None: the dataset's
     episode_s: float = 30.0  # seconds until an episode is cut off and its label is waited for
-    joint_margin: float = (
-        0.05  # how far goals may go beyond the joints seen in demonstrations, as a share of their range
-    )
+    joint_margin: float = 0.05  # goals may go so far beyond the joints of the demonstrations, a share of their range
     joint_limits: dict[str, list[float]] = field(default_factory=dict)  # [low, high] of a joint, instead of that
     step_factor: float = 1.5  # largest distance of a goal from the arm, and speed, over the largest in demonstrations
     workspace: list[float] | None = None  # box of the tip, m: x_low, x_high, y_low, y_high, z_low, z_high

@@ -4,7 +4,7 @@ import httpx
 from huggingface_hub import constants, get_token
 from huggingface_hub.errors import HfHubHTTPError
 
-from lerobot_cqn.errors import CQNError
+from .errors import CQNError
 
 __all__ = ["PASSING", "HubError", "cause", "passing", "refuse_to_start", "said", "transport"]
 
