@@ -12,7 +12,7 @@ import threading
 from collections.abc import Sequence
 from types import FrameType
 
-from .console import Interrupted, note, quiet, result
+from .console import Interrupted, explain, note, quiet, result
 
 __all__ = ["OPERATIONS", "main"]
 
@@ -36,7 +36,7 @@ OPERATIONS = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run ``cqn-data OPERATION --name=value ...`` and return the exit code; raises only with ``--debug``.
+    """Run ``cqn-data OPERATION --name=value ...`` and return the exit code; ``--debug`` shows tracebacks.
 
     Args:
         argv: arguments after the program name; those of the process by default.
@@ -58,9 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         note(str(error) if isinstance(error, Interrupted) else "Interrupted: nothing was written.")
         return 130
     except Exception as error:
-        if debug:
-            raise
-        return _explain(name, error)
+        return explain(f"cqn-data {name}", error, debug=debug)
     finally:
         if main_thread:
             signal.signal(signal.SIGTERM, before)
@@ -77,17 +75,6 @@ def _run(name: str, args: list[str]) -> int:
         return 0
     code = module.main(args)
     return code if isinstance(code, int) else 0
-
-
-def _explain(name: str, error: Exception) -> int:
-    from lerobot_cqn.errors import CQNError
-
-    text = " ".join(str(error).split()) or type(error).__name__
-    if isinstance(error, CQNError):
-        note(f"cqn-data {name}: error: {text}")
-        return 2
-    note(f"cqn-data {name}: unexpected {type(error).__name__}: {text[:300]} (--debug shows where)")
-    return 1
 
 
 def _overview() -> str:

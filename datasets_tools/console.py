@@ -2,6 +2,7 @@
 
 import logging
 import os
+import traceback
 import warnings
 from collections.abc import Iterable, Sequence
 
@@ -10,7 +11,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-__all__ = ["Interrupted", "load_lerobot", "note", "progress", "quiet", "result", "table"]
+__all__ = ["Interrupted", "explain", "load_lerobot", "note", "progress", "quiet", "result", "table"]
 
 MAX_ROWS = 40
 
@@ -49,6 +50,23 @@ def note(message: str) -> None:
 def result(message: str) -> None:
     """Print one line of result to stdout."""
     Console(highlight=False, soft_wrap=True).print(message, markup=False)
+
+
+def explain(program: str, error: Exception, *, debug: bool = False) -> int:
+    """Say in one line why a command ends; returns its exit code: 2 for what its user can mend, 1 for anything else.
+
+    debug: the traceback comes first.
+    """
+    from lerobot_cqn.errors import CQNError
+
+    if debug:
+        traceback.print_exception(error)
+    text = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, CQNError | OSError):
+        note(f"{program}: error: {text}")
+        return 2
+    note(f"{program}: unexpected {type(error).__name__}: {text[:300]}" + ("" if debug else " (--debug shows where)"))
+    return 1
 
 
 def progress() -> Progress:

@@ -19,13 +19,14 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from cqn_data.console import explain
 from lerobot_cqn.errors import ConfigError, CQNError, one_of
 
 __all__ = ["Plan", "Run", "load_plan", "main", "runs_of"]
 
 HELP = """cqn-bench: train every method on every task with every seed, then compare.
 
-Usage: cqn-bench PLAN.yaml --output_dir=DIR [--processes=2] [--report_only]
+Usage: cqn-bench PLAN.yaml --output_dir=DIR [--processes=2] [--report_only] [--debug]
 
 A plan is a YAML file:
 
@@ -247,6 +248,8 @@ def _options(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `cqn-bench`; returns 0, 1 when a run failed, 2 for an error of the user's, 130 after an interrupt."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in arguments
+    arguments = [a for a in arguments if a != "--debug"]
     console = Console(highlight=False, soft_wrap=True)
     if not arguments or "-h" in arguments or "--help" in arguments:
         console.print(HELP, markup=False)
@@ -273,9 +276,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         console.print("Stopped; the same command continues.")
         return 130
-    except CQNError as error:
-        console.print(f"cqn-bench: {' '.join(str(error).split())}", markup=False)
-        return 2
+    except (CQNError, OSError) as error:
+        return int(explain("cqn-bench", error, debug=debug))
     return int(any(run.state in ("failed", "stopped") for run in runs))
 
 

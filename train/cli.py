@@ -5,7 +5,6 @@ import logging
 import shutil
 import signal
 import sys
-import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -25,6 +24,7 @@ from lerobot.policies.factory import get_policy_class, make_policy, make_pre_pos
 from lerobot.utils.constants import ACTION
 from lerobot.utils.import_utils import register_third_party_plugins
 
+from cqn_data.console import explain
 from lerobot_cqn.base_config import RLConfig
 from lerobot_cqn.base_policy import RLPolicy
 from lerobot_cqn.errors import ConfigError, CQNError, OutputExistsError
@@ -297,10 +297,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"cqn-train: {error or 'stopped at once; the last checkpoint is untouched.'}", file=sys.stderr)  # noqa: T201
         return 130
     except (CQNError, OSError) as error:
-        if debug:
-            traceback.print_exc()
-        print(f"cqn-train: {' '.join(str(error).split())}", file=sys.stderr)  # noqa: T201
-        return 2
+        return int(explain("cqn-train", error, debug=debug))
 
 
 def run(config: RunConfig) -> int:

@@ -53,25 +53,24 @@ def curves(evaluations: Mapping[str, Rows], labels: Mapping[str, str], expert: f
 
 
 def arm_session(episodes: Rows, evaluations: Rows) -> bytes:
-    """A session on an arm: every episode, the running mean of 5 (the paper's measure), evaluations before and after."""
+    """A session on an arm: success of every episode and its running mean of 5 (the paper's measure), the share of each
+    that a person drove, and evaluations before and after.
+    """
     figure, axes = _pyplot().subplots(figsize=(7.2, 3.2))
     success = np.array([float(row["success"]) for row in episodes])
-    taught = np.array([int(row["taught"]) > 0 for row in episodes])
+    driven = np.array([int(row["taught"]) / int(row["length"]) for row in episodes])
     number = np.arange(1, len(success) + 1)
     mean = [success[max(0, i - 5) : i].mean() for i in number]
     axes.plot(number, mean, color=COLOURS["filtered"], label="running mean of 5 episodes")
-    for chosen, colour, text in (
-        (~taught, "0.55", "episode"),
-        (taught, COLOURS["unfiltered"], "with the leader's help"),
-    ):
-        axes.scatter(number[chosen], success[chosen], s=14, color=colour, label=text, zorder=3)
+    axes.scatter(number, success, s=14, color=COLOURS["filtered"], label="episode", zorder=3)
+    axes.bar(number, driven, color=COLOURS["unfiltered"], alpha=0.6, label="share driven with the leader")
     ends = {"offline": 0, "final": len(success) + 1}
     rows = [row for row in evaluations if row["phase"] in ends]
     place, rate = [ends[row["phase"]] for row in rows], np.array([float(row["success_rate"]) for row in rows])
     spread = [rate - [float(r["ci_low"]) for r in rows], [float(r["ci_high"]) for r in rows] - rate]
     text = f"evaluation, n = {rows[0]['n']}, 95 %" if rows else "evaluation"
     axes.errorbar(place, rate, yerr=spread, fmt="D", color="black", markersize=5, capsize=3, label=text)
-    axes.set(xlabel="episodes online", ylabel="success", ylim=(-0.05, 1.07))
+    axes.set(xlabel="episodes online", ylabel="success, share of steps", ylim=(-0.05, 1.07))
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False, fontsize=8)
     return _png(figure)
 

@@ -2,7 +2,6 @@
 
 import shlex
 import sys
-import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,14 +10,14 @@ from huggingface_hub import constants
 from huggingface_hub.utils import disable_progress_bars  # type: ignore[attr-defined]
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from cqn_data.console import Interrupted, note, quiet, result
+from cqn_data.console import Interrupted, explain, note, quiet, result
 from cqn_data.hub import Hub
 from cqn_data.hub_files import size_of
 from cqn_data.hub_options import HubTarget, check_repo_id
 from cqn_data.hub_report import megabytes, show_dry, show_sent
 from cqn_data.options import help_page, option, parse
 from cqn_data.readme import Readme, union
-from lerobot_cqn.errors import ConfigError, CQNError, DataError
+from lerobot_cqn.errors import ConfigError, DataError
 from lerobot_cqn.hub_errors import refuse_to_start
 from lerobot_cqn.model_card import ModelFacts, front_matter, write_part
 
@@ -166,14 +165,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         note(str(error) if isinstance(error, Interrupted) else "Interrupted: nothing was sent.")
         return 130
     except Exception as error:
-        if debug:
-            traceback.print_exc()
-        text = " ".join(str(error).split())
-        if isinstance(error, CQNError | OSError):
-            note(f"cqn-push: error: {text}")
-            return 2
-        note(f"cqn-push: unexpected {type(error).__name__}: {text[:300]} (--debug shows where)")
-        return 1
+        return int(explain(TOOL, error, debug=debug))
 
 
 if __name__ == "__main__":

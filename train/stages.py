@@ -14,6 +14,7 @@ from typing import Any
 import draccus
 from rich.console import Console
 
+from cqn_data.console import explain
 from lerobot_cqn.errors import CQNError
 
 __all__ = ["DemoError", "Stages", "fresh", "read_rows", "run_once"]
@@ -124,6 +125,5 @@ def run_once(
         console.print("Stopped; start it again to continue.")
         return 130
     except CQNError as error:
-        console.print(f"{name}: {error}", style="red")
-        return 2
+        return int(explain(name, error))
     return 0

@@ -228,7 +228,7 @@ def assert_refused(arguments: list[str], said: list[str], capfd: pytest.CaptureF
     code = main(arguments)
     err = capfd.readouterr().err
     assert code == 2, err
-    assert err.startswith("cqn-train: ")
+    assert err.startswith("cqn-train: error: ")
     assert err.count("\n") == 1, err
     for part in said:
         assert part in err
@@ -394,5 +394,5 @@ def test_from_a_terminal(command: Command, tmp_path: Path) -> None:
     """The installed command, without a test's capture around it: one line, exit code 2."""
     done = command("cqn-train", *TINY_POLICY, "--policy.levls=2", f"--output_dir={tmp_path / 'run'}", code=2)
     assert done.stdout == ""
-    assert done.stderr.startswith("cqn-train: Unknown option '--policy.levls'")
+    assert done.stderr.startswith("cqn-train: error: Unknown option '--policy.levls'")
     assert done.stderr.count("\n") == 1

@@ -264,7 +264,7 @@ def test_a_push_that_fails_loses_no_run(
     folder = tmp_path / "run"
     assert cqn_train(short(click, folder, f"--policy.repo_id={REPO}")) == 2
     last = capsys.readouterr().err.strip().splitlines()[-1]
-    assert last.startswith("cqn-train: ")
+    assert last.startswith("cqn-train: error: ")
     assert f"cqn-push --run={folder} --repo_id={REPO}" in last
     hub.heal()
     push(folder)

@@ -69,6 +69,8 @@ def test_record_options_are_checked(capsys, args, said):
     assert said in fails(capsys, "record", "--repo_id=a/b", *args)
 
 
-def test_debug_shows_the_exception():
-    with pytest.raises(ValueError, match="Unknown operation"):
-        main(["filtr", "--debug"])
+def test_debug_shows_where_and_the_same_line_last(capsys):
+    assert main(["filtr", "--debug"]) == 2
+    printed = capsys.readouterr().err
+    assert "Traceback" in printed
+    assert printed.strip().splitlines()[-1].startswith("cqn-data filtr: error: Unknown operation 'filtr'")
