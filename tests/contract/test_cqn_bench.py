@@ -72,8 +72,8 @@ def test_a_failed_run_is_named_and_the_others_go_on(
     content["tasks"] = {"click": [option for option in content["tasks"]["click"] if "dataset.root" not in option]}
     plan.write_text(json.dumps(content))
     assert main([str(plan), f"--output_dir={tmp_path / 'out'}"]) == 2
-    said = capsys.readouterr().out.replace("\n", "")
-    assert "click / bad / 1 failed: cqn-train: No dataset at nowhere" in said
+    said = "".join(capsys.readouterr()).replace("\n", "")
+    assert "click / bad / 1 failed: cqn-train: error: No dataset at nowhere" in said
     assert f"(log: {tmp_path / 'out/click/bad/1'}.log)" in said
     assert "there is nothing to report" in said
 
@@ -85,7 +85,7 @@ def test_wrong_arguments_of_a_method_are_found_before_any_run(
     content["methods"]["bad"] = ["--policy.type=cqn", "--policy.preset=no_such"]
     plan.write_text(json.dumps(content))
     assert main([str(plan), f"--output_dir={tmp_path / 'out'}"]) == 2
-    assert "click / bad: Unknown preset 'no_such'" in capsys.readouterr().out
+    assert "click / bad: Unknown preset 'no_such'" in "".join(capsys.readouterr())
     assert not (tmp_path / "out").exists()
 
 
@@ -122,7 +122,7 @@ def test_plans_that_cannot_work_say_why(tmp_path: Path, text: str, said: str) ->
 )
 def test_wrong_arguments(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(arguments) == 2
-    assert said in capsys.readouterr().out
+    assert said in "".join(capsys.readouterr())
 
 
 def test_every_combination_is_a_run_and_the_shipped_plan_is_one() -> None:

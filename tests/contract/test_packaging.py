@@ -1,42 +1,20 @@
 """What a user installs: the wheel holds all of it, LeRobot finds it, and the user's own files do not get in the way."""
 
 import os
-import shutil
 import subprocess
 import sys
-import tomllib
 import zipfile
 from email.parser import Parser
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
-SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-FOLDERS = ("lerobot_cqn", "datasets_tools", "train")
-INSTALLED = ("lerobot_cqn", "lerobot_policy_cqn", "cqn_data", "cqn_train")
-LEFTOVERS = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info")
+from ..release import build
+from ..release.build import FOLDERS, INSTALLED, ROOT, SETTINGS, installed_name
+from ..release.extras import EXTRAS, PROBES
+from ..release.smoke import commands
 
-DISCOVERY = """
-import sys
-from lerobot.utils.import_utils import register_third_party_plugins
-register_third_party_plugins()
-from lerobot.configs.policies import PreTrainedConfig
-from lerobot.envs.configs import EnvConfig
-print("policy", "cqn" in PreTrainedConfig.get_known_choices())
-print("env", "ur5e_station" in EnvConfig.get_known_choices())
-for name in ("lerobot_cqn", "lerobot_policy_cqn", "cqn_data", "cqn_train"):
-    module = __import__(name)
-    print(name, module.__file__)
-"""
-
-
-def installed_name(folder: str) -> str:
-    """The package a source folder becomes: `train/envs` -> `cqn_train.envs`."""
-    for package, source in sorted(SETTINGS["tool"]["setuptools"]["package-dir"].items(), key=lambda x: -len(x[1])):
-        if folder == source or folder.startswith(source + "/"):
-            return package + folder.removeprefix(source).replace("/", ".")
-    return folder.replace("/", ".")
+DISCOVERY = (ROOT / "tests/release/inside/discovery.py").read_text(encoding="utf-8")
 
 
 def run(*command: str, cwd: Path, path: str = "") -> "subprocess.CompletedProcess[str]":
@@ -47,25 +25,23 @@ def run(*command: str, cwd: Path, path: str = "") -> "subprocess.CompletedProces
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> Path:
-    """Built from a copy, because setuptools packs whatever an earlier build left in build/."""
-    source = tmp_path_factory.mktemp("source")
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    for name in FOLDERS:
-        shutil.copytree(ROOT / name, source / name, ignore=LEFTOVERS)
-    for name in ("tests", "outputs"):  # must not be picked up
-        (source / name).mkdir()
-        (source / name / "__init__.py").touch()
-    run(sys.executable, "-m", "build", "--wheel", "--no-isolation", cwd=source)
-    (built,) = (source / "dist").glob("*.whl")
-    return built
+def source(tmp_path_factory) -> Path:
+    """A clean copy, with folders that must not be picked up."""
+    folder = build.clean_copy(tmp_path_factory.mktemp("source"))
+    for name in ("outputs", "data"):
+        (folder / name).mkdir(exist_ok=True)
+        (folder / name / "__init__.py").touch()
+    return folder
 
 
 @pytest.fixture(scope="module")
-def content(wheel) -> set[str]:
-    with zipfile.ZipFile(wheel) as archive:
-        return set(archive.namelist())
+def sdist(source, tmp_path_factory) -> Path:
+    return build.build(source, "sdist", tmp_path_factory.mktemp("sdist") / "dist")
+
+
+@pytest.fixture(scope="module")
+def wheel(source, sdist, tmp_path_factory) -> Path:  # after the sdist, which setuptools would fill with build/
+    return build.build(source, "wheel", tmp_path_factory.mktemp("wheel") / "dist")
 
 
 @pytest.fixture(scope="module")
@@ -90,35 +66,56 @@ def test_every_package_folder_is_listed():
     assert {installed_name(folder) for folder in folders} == listed, "see [tool.setuptools] packages in pyproject.toml"
 
 
-def test_every_source_file_is_in_the_wheel(content):
-    """Also what is not Python: type marker, models, static pages (package-data in pyproject.toml)."""
-    missing = []
-    for path in sorted(path for name in FOLDERS for path in (ROOT / name).rglob("*") if path.is_file()):
-        inside = path.relative_to(ROOT)
-        if not any(part.startswith(".") or part == "__pycache__" for part in inside.parts):
-            package = installed_name(inside.parent.as_posix()).replace(".", "/")
-            missing += [] if f"{package}/{path.name}" in content else [str(inside)]
-    assert not missing
+def test_every_file_of_the_packages_is_packed(source):
+    """Also what is not Python: type marker, recipes, static pages (package-data in pyproject.toml)."""
+    files = {path for name in FOLDERS for path in (source / name).rglob("*") if path.is_file()}
+    packed = build.packed_files(source)
+    assert not sorted(str(path) for path in files if path.relative_to(source).as_posix() not in packed)
+    assert {"datasets_tools/recipes/simulation.yaml", "train/operator_page/static/index.html"} <= packed.keys()
 
 
-def test_wheel_holds_nothing_else(content):
-    tops = {name.split("/")[0] for name in content}
-    assert tops == {*INSTALLED, f"lerobot_policy_cqn-{SETTINGS['project']['version']}.dist-info"}
-    assert {f"{name}/py.typed" for name in ("lerobot_cqn", "cqn_data", "cqn_train")} <= content
+def test_wheel_and_sdist_hold_that_and_nothing_else(wheel, sdist, source):
+    assert build.wheel_problems(wheel, source) == []
+    assert build.sdist_problems(sdist, source) == []
 
 
-def test_metadata(wheel, content):
-    (info,) = {name.split("/")[0] for name in content if ".dist-info/" in name}
+def test_what_is_too_much_or_too_little_is_found(wheel, source, tmp_path):
+    spoilt = tmp_path / wheel.name
+    with zipfile.ZipFile(wheel) as archive, zipfile.ZipFile(spoilt, "w") as other:
+        for name in archive.namelist():
+            if name != "cqn_data/py.typed":
+                other.writestr(name, archive.read(name))
+        other.writestr("tests/test_x.py", "")
+        other.writestr("cqn_train/picture.png", "")
+    assert [problem.split(" in")[0] for problem in build.wheel_problems(spoilt, source)] == [
+        "cqn_data/py.typed is missing",
+        "cqn_train/picture.png does not belong",
+        "tests/test_x.py does not belong",
+    ]
+    assert build.different_files(wheel, spoilt) == ["cqn_data/py.typed", "cqn_train/picture.png", "tests/test_x.py"]
+
+
+def test_the_sdist_builds_the_same_wheel(wheel, sdist, tmp_path):
+    unpacked = build.unpack(sdist, tmp_path / "unpacked")
+    assert build.different_files(wheel, build.build(unpacked, "wheel", tmp_path / "again")) == []
+
+
+def test_every_extra_is_tried_before_a_release():
+    assert PROBES.keys() == EXTRAS.keys(), "see tests/release/extras.py"
+    for extra in PROBES.values():
+        assert extra.missing is not None or extra.why_never
+
+
+def test_metadata(wheel):
+    (info,) = {name.split("/")[0] for name in build.wheel_content(wheel) if ".dist-info/" in name}
     with zipfile.ZipFile(wheel) as archive:
         metadata = Parser().parsestr(archive.read(f"{info}/METADATA").decode())
-        entry_points = archive.read(f"{info}/entry_points.txt").decode()
         licence = archive.read(f"{info}/licenses/LICENSE").decode()
     # LeRobot compares this very spelling: with dashes the plugin would be ignored.
     assert metadata["Name"] == "lerobot_policy_cqn"
     assert metadata["License-Expression"] == "Apache-2.0"
     assert "Apache License" in licence
-    assert "cqn-data = cqn_data.cli:main" in entry_points
-    assert "cqn-train = cqn_train.cli:main" in entry_points
+    assert commands(wheel) == sorted(SETTINGS["project"]["scripts"])
 
 
 def _discover(cwd: Path, path: str) -> dict[str, str]:
@@ -126,6 +123,7 @@ def _discover(cwd: Path, path: str) -> dict[str, str]:
     found = dict(line.split(" ", 1) for line in done.stdout.splitlines() if " " in line)
     assert found["policy"] == "True", done.stderr
     assert found["env"] == "True", done.stderr
+    assert found["robot"] == "True", done.stderr
     return found
 
 
@@ -141,8 +139,8 @@ def test_lerobot_finds_the_editable_install(hostile):
         assert Path(found[name]).resolve().is_relative_to(ROOT), f"{name} is not the checkout's: {found[name]}"
 
 
-@pytest.mark.parametrize("command", ["cqn-train", "cqn-data"])
+@pytest.mark.parametrize("command", sorted(SETTINGS["project"]["scripts"]))
 def test_commands_of_the_wheel(installed, hostile, command):
     script = installed / "bin" / command
     done = run(sys.executable, str(script), "--help", cwd=hostile, path=f".{os.pathsep}{installed}")
-    assert "usage" in done.stdout.lower()
+    assert f"{command} " in done.stdout
