@@ -214,7 +214,9 @@ def need(package: str) -> Any:
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        raise ConfigError(f"This format needs {package}: pip install 'lerobot_policy_cqn[convert]'.") from error
+        raise ConfigError(
+            f"This format needs {package}, which cannot be imported ({error}): pip install 'lerobot_policy_cqn[convert]'."
+        ) from error
 
 
 def choose(what: str, wanted: Iterable[str], there: Iterable[str]) -> list[str]:

@@ -1,0 +1,1 @@
+"""What is tried before a release: `make release-check` and `make compatibility`; both need the network."""
