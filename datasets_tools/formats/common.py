@@ -215,7 +215,8 @@ def need(package: str) -> Any:
         return importlib.import_module(package)
     except ImportError as error:
         raise ConfigError(
-            f"This format needs {package}, which cannot be imported ({error}): pip install 'lerobot_policy_cqn[convert]'."
+            f"This format needs {package}, which cannot be imported ({error}): "
+            "pip install 'lerobot_policy_cqn[convert]'."
         ) from error
 
 

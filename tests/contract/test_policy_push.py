@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -223,17 +224,19 @@ def test_it_loads_back_in_lerobot_eval_and_trains_on(
     hub: HubServer, run: Path, click: list[str], tmp_path: Path
 ) -> None:
     push(run)
-    call = subprocess_of(hub, tmp_path)
-    call(
-        "lerobot-eval", f"--policy.path={REPO}", *STATION, "--eval.n_episodes=1", "--eval.batch_size=1",
-        "--policy.device=cpu", f"--output_dir={tmp_path / 'eval'}",
-    )  # fmt: skip
+    call, card = subprocess_of(hub, tmp_path), hub.files("models", REPO)["README.md"].decode()
+
+    def told(command: str, *but: str) -> list[str]:
+        """The arguments that the card gives a command, without some that make it long."""
+        text = card[card.index(f"{command} --policy.path") :].partition("\n```")[0]
+        return [a for a in shlex.split(text.replace("\\\n", " "))[1:] if not a.startswith(but)]
+
+    call("lerobot-eval", *told("lerobot-eval", "--eval"), "--eval.n_episodes=1", "--eval.batch_size=1",
+         "--policy.device=cpu", f"--output_dir={tmp_path / 'eval'}")  # fmt: skip
     assert "pc_success" in (tmp_path / "eval" / "eval_info.json").read_text()
-    # The card's own command, made short.
-    card = hub.files("models", REPO)["README.md"].decode()
-    command = card[card.index("cqn-train --policy.path") :].partition("\n```")[0].replace("\\\n", " ").split()
-    given = [a for a in command[1:] if not a.startswith(("--steps", "--output_dir", "--dataset"))]
-    call("cqn-train", *given, *click, *STATION[1:], "--steps=20", f"--output_dir={tmp_path / 'more'}",
+    given = told("cqn-train", "--steps", "--output_dir", "--dataset")
+    assert {STATION[0], STATION[2], "--batch_size=4"} <= set(given)
+    call("cqn-train", *given, *click, "--steps=20", f"--output_dir={tmp_path / 'more'}",
          "--eval.final_n_episodes=1", "--save_freq=100", "--threads=1")  # fmt: skip
     rows = (tmp_path / "more" / "episodes.csv").read_text().splitlines()
     assert len(rows) == 3
