@@ -35,6 +35,7 @@ class ArmDemoConfig:
     demonstrations: int = 20
     offline_updates: int = 60
     steps: int = 1800
+    helped_episodes: int = 15  # in which the simulated person takes over where a try takes long
     eval_episodes: int = 40
     episode_s: float = 6.5  # simulated
     port: int = 8765
@@ -94,6 +95,7 @@ def _train(stages: Stages, config: ArmDemoConfig, data: Path, run: Path, arm: tu
             "--policy.type=cqn", "--policy.preset=laptop_state", "--policy.device=cpu", *arm,
             "--robot.camera_names=[left_shoulder]", "--robot.image_height=168", "--robot.image_width=224",
             f"--robot.person=http://127.0.0.1:{config.port}", "--robot.person_takes_over_s=3.5",
+            f"--robot.person_helps_episodes={config.helped_episodes}",
             "--teleop.type=sim_leader", "--dataset.repo_id=demo/clean", f"--dataset.root={data}",
             f"--output_dir={fresh(run)}", f"--seed={config.seed}", f"--offline_updates={config.offline_updates}",
             f"--steps={config.steps}", f"--eval.final_n_episodes={config.eval_episodes}",

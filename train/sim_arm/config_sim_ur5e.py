@@ -68,6 +68,7 @@ class SimUR5eConfig(RobotConfig):
     faults: list[Fault] = field(default_factory=list)  # what goes wrong, and when
     person: str = ""  # address of an operator's page where a simulated person answers (token: CQN_PAGE_TOKEN)
     person_takes_over_s: float = 0.0  # simulated seconds of an episode until this person takes the leader; 0: never
+    person_helps_episodes: int = 0  # episodes of a run in which this person takes the leader at all; 0: all
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -80,6 +81,7 @@ class SimUR5eConfig(RobotConfig):
             raise ConfigError(f"person is '{self.person}': expected the page's address, http://127.0.0.1:8765.")
         for name, value, low, high in (
             ("person_takes_over_s", self.person_takes_over_s, 0.0, 3600.0),
+            ("person_helps_episodes", self.person_helps_episodes, 0, 10**6),
             ("speed", self.speed, 0.01, 100.0),
             ("ramp_s", self.ramp_s, 0.004, 1.0),
             ("image_height", self.image_height, 16, 1024),

@@ -23,12 +23,15 @@ class SimPerson:
     What it knows is what a person sees: whether the task is done and whether the arm is home.
     """
 
-    def __init__(self, world: World, url: str, takes_over_s: float = 0.0) -> None:
+    def __init__(self, world: World, url: str, takes_over_s: float = 0.0, helps_episodes: int = 0) -> None:
         """Watch a world and answer at `url` (http://host:port), with the token of CQN_PAGE_TOKEN.
 
         takes_over_s: simulated seconds of an episode after which it takes the leader, until the task is done; 0: never.
+        helps_episodes: how many episodes of the run it does so in, at their beginning; 0: all. A policy that is always
+            helped learns to wait for help.
         """
         self.world, self.url, self.takes_over_s = world, url.rstrip("/"), takes_over_s
+        self.helps_episodes = helps_episodes
         self._closing = threading.Event()
         self._state, self._since, self._done_at = "", 0.0, -1.0
         self._thread = threading.Thread(target=self._run, name="simulated-person", daemon=True)
@@ -61,14 +64,15 @@ class SimPerson:
         elif self._done_at < 0:
             self._done_at = world.now
         done = self._done_at >= 0 and world.now - self._done_at >= SURE_S
-        event = self._answer(state, done, world.now - self._since)
+        event = self._answer(state, done, world.now - self._since, int(session["episode"]))
         if event and event in session["allowed"]:
             self._ask("/api/event", {"event": event})
 
-    def _answer(self, state: str, done: bool, seconds: float) -> str:
+    def _answer(self, state: str, done: bool, seconds: float, episode: int) -> str:
         if state in ("running", "teaching") and done:
             return "success"
-        if state == "running" and 0 < self.takes_over_s < seconds:
+        helps = self.takes_over_s > 0 and (not self.helps_episodes or episode < self.helps_episodes)
+        if state == "running" and helps and seconds > self.takes_over_s:
             return "take_over"
         if state == "labelling":
             return "success" if self.world.success else "failure"

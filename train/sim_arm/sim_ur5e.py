@@ -87,7 +87,7 @@ class SimUR5e(Robot):
             raise ConfigError(f"There is an arm in the world '{c.world}' already: give another --robot.world.")
         self._world = WORLDS[c.world] = World(c.task, c.speed, c.ramp_s, c.seed)
         if c.person:
-            self._person = SimPerson(self._world, c.person, c.person_takes_over_s)
+            self._person = SimPerson(self._world, c.person, c.person_takes_over_s, c.person_helps_episodes)
             self._person.start()
 
     def calibrate(self) -> None:
