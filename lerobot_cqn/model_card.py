@@ -43,8 +43,8 @@ METHODS = {
 }
 # Of a configuration, what is a machine's own or follows from the rest.
 OWN = {
-    "type", "id", "port", "calibration_dir", "person", "person_takes_over_s", "person_helps_episodes", "features", "features_map",
-    "discover_packages_path",
+    "type", "id", "port", "calibration_dir", "person", "person_takes_over_s", "person_helps_episodes", "features",
+    "features_map", "discover_packages_path",
 }  # fmt: skip
 PACKAGES = ("lerobot_policy_cqn", "lerobot", "torch")
 CITATION = r"""@inproceedings{seo2024continuous,
