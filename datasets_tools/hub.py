@@ -99,7 +99,10 @@ class Hub:
             behind = cause(error)
             if passing(behind):
                 raise ConnectionError(said(behind)) from error
-            raise self._explained(behind) from error
+            status = behind.response.status_code if isinstance(behind, HfHubHTTPError) else said(behind)
+            raise HubError(
+                f"The Hub does not accept the token ({status}): log in with `hf auth login`, or train without a push."
+            ) from error
         names = {account["name"], *(org["name"] for org in account.get("orgs", []))}
         if owner not in names:
             raise HubError(

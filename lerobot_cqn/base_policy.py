@@ -208,13 +208,13 @@ class RLPolicy(PreTrainedPolicy):
         env, repo_id = getattr(cfg, "env", None), self.config.repo_id or f"user/{model_type}"
         local = getattr(getattr(cfg, "dataset", None), "root", None) is not None
         data = data_facts(dataset_meta, dataset_repo_id, public=not local) if dataset_meta is not None else None
-        rows = {"Trained with": "lerobot-train, offline"}
+        rows, where = {"Trained with": "lerobot-train, offline"}, ["--dataset.root=..."] if local else []
         if cfg is not None:
             rows |= {"Updates": str(cfg.steps), "Batch size": str(cfg.batch_size), "Seed": str(cfg.seed)}
         tasks = list(dataset_meta.tasks.index) if dataset_meta is not None else []
         facts = ModelFacts(
             repo_id, self.config, str(tasks[0]) if tasks else dataset_repo_id, rows,
-            commands(repo_id, env=env, dataset=dataset_repo_id), license, tags or (), data,
+            commands(repo_id, env=env, dataset=dataset_repo_id, more=where), license, tags or (), data,
         )  # fmt: skip
         return ModelCard(as_readme(facts, constants.ENDPOINT))
 

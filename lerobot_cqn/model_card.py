@@ -110,6 +110,7 @@ class ModelFacts:
         tags: further ones.
         data: the demonstrations; None where there were none.
         results: evaluations, in the order of training; the last one is the policy's.
+        origin: the policy that it was continued from: user/name on the Hub, or what else to call it; None: none.
         curve: path of a picture in the repository.
         films: paths of films in the repository.
         files: further paths -> what they hold.
@@ -124,6 +125,7 @@ class ModelFacts:
     tags: Sequence[str] = ()
     data: DataFacts | None = None
     results: Sequence[Evaluated] = ()
+    origin: str | None = None
     curve: str | None = None
     films: Sequence[str] = ()
     files: Mapping[str, str] = field(default_factory=dict)
@@ -148,7 +150,7 @@ def data_facts(meta: Any, repo_id: str, episodes: Sequence[int] | None = None, *
     stats = (meta.stats or {}).get(ACTION, {})
     bounds = [np.asarray(stats[end]).reshape(-1) for end in ("min", "max")] if "min" in stats else []
     rows = [
-        (plain(name), "joint difference" if name in changed else "as recorded", *(f"{end[i]:.4g}" for end in bounds))
+        (plain(name), action_kind(name in changed, any_changed=bool(changed)), *(f"{end[i]:.4g}" for end in bounds))
         for i, name in enumerate(names)
     ]
     return DataFacts(
@@ -196,6 +198,7 @@ def front_matter(facts: ModelFacts) -> dict[str, Any]:
         license=facts.license or LICENSE, library_name="lerobot", pipeline_tag="robotics", tags=tags,
         model_name=facts.repo_id.partition("/")[2] or facts.config.type, eval_results=results,
         datasets=[facts.data.repo_id] if facts.data is not None and facts.data.public else None,
+        base_model=facts.origin if facts.origin and "/" in facts.origin else None,
     )  # fmt: skip
     return dict(card.to_dict())  # type: ignore[no-untyped-call]
 
@@ -262,6 +265,7 @@ def _shell(arguments: Sequence[str], width: int = 110) -> str:
 def _introduction(facts: ModelFacts) -> str:
     name, how = METHODS.get(facts.config.type, (facts.config.type, ""))
     learned = "from demonstrations" if facts.data is not None else "without demonstrations"
+    learned += f", continued from {_origin(facts.origin)}," if facts.origin else ""
     rate = ""
     if facts.results:
         last = facts.results[-1]
@@ -270,6 +274,10 @@ def _introduction(facts: ModelFacts) -> str:
         f"A **{name}** policy for [LeRobot](https://github.com/huggingface/lerobot), trained {learned} on "
         f"**{plain(facts.task)}**.{rate} {how}".rstrip()
     )
+
+
+def _origin(origin: str) -> str:
+    return f"[{plain(origin)}](https://huggingface.co/{origin})" if "/" in origin else plain(origin)
 
 
 def _pictures(facts: ModelFacts, endpoint: str) -> list[str]:
@@ -289,10 +297,13 @@ def _results(facts: ModelFacts) -> str:
 
 
 def _use(facts: ModelFacts) -> str:
+    local = ""
+    if facts.data is not None and not facts.data.public:
+        local = " The demonstrations are not on the Hub: name a dataset of yours, and its folder with `--dataset.root`."
     return (
         "The policy is part of the LeRobot plugin `lerobot_policy_cqn`; where it is installed, LeRobot finds it by "
         f"itself.\n\nEvaluate:\n\n```bash\n{facts.commands.evaluate}\n```\n\n"
-        f"Continue training online, from these weights:\n\n```bash\n{facts.commands.go_on}\n```"
+        f"Continue training online, from these weights.{local}\n\n```bash\n{facts.commands.go_on}\n```"
     )
 
 
@@ -347,9 +358,16 @@ def _files(facts: ModelFacts) -> str:
         "no optimiser state",
         "policy_preprocessor*, policy_postprocessor*": "scaling, bounds and joint goals, which LeRobot applies",
         "train_config.json": "the command's settings, without folders of the machine",
+        **({facts.curve: "success rate in the course of training"} if facts.curve else {}),
+        **dict.fromkeys(facts.films, "an evaluation episode"),
         **facts.files,
     }
     return _rows(("file", "what"), [(f"`{code(name)}`", plain(what)) for name, what in rows.items()])
+
+
+def action_kind(changed: bool, *, any_changed: bool) -> str:
+    """What an action dimension is: `cqn-data delta` made differences of it, or left it, or nothing was converted."""
+    return "joint difference" if changed else "absolute" if any_changed else "as the robot takes it"
 
 
 def changed_from_preset(config: RLConfig) -> dict[str, Any]:

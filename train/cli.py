@@ -21,7 +21,7 @@ from lerobot.configs.types import FeatureType
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.policies.factory import get_policy_class, make_policy, make_pre_post_processors
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from cqn_data.console import explain
@@ -85,7 +85,9 @@ def build(
                 replay.add_demonstration(episode)
                 demonstrations.append(replace(episode, pixels=()))
         bounds = gym.action_bounds() if gym is not None else None
-        for sentence in warnings_about(demonstrations, free=agent.inside(bounds)):
+        state = config.policy.low_dim_features.get(OBS_STATE)
+        joints = state.shape[0] if state is not None else 0
+        for sentence in warnings_about(demonstrations, free=agent.inside(bounds), joints=joints):
             monitor.message(f"Warning: {sentence}")
         finished = replay.reopen() if checkpoint is not None else []
     config.output_dir.mkdir(parents=True, exist_ok=True)

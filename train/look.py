@@ -25,12 +25,15 @@ TOO_MANY = 0.2  # share of the steps
 INK, PAPER, GRID, UP, DOWN = (24, 26, 31), (255, 255, 255), (228, 230, 235), (46, 111, 182), (196, 92, 38)
 
 
-def warnings_about(episodes: Sequence[Episode], free: NDArray[Any] | None = None) -> list[str]:
+def warnings_about(
+    episodes: Sequence[Episode], free: NDArray[Any] | None = None, joints: int | None = None
+) -> list[str]:
     """Sentences about demonstrations from which learning is hard; empty when nothing looks wrong.
 
     Args:
         episodes: in normalised units, as the replay takes them.
         free: action dimensions [D] whose bounds could be wider; None: all. Where the environment ends, nothing is lost.
+        joints: how many of the state's values, from the first on, are joints; None: all. Objects leap or lie still.
     """
     if not episodes:
         return []
@@ -39,15 +42,15 @@ def warnings_about(episodes: Sequence[Episode], free: NDArray[Any] | None = None
         found.append("No demonstration ends in success, so there is nothing to imitate: label them (cqn-data label).")
     actions = np.concatenate([episode.action for episode in episodes])
     varied = np.ptp(actions, axis=0) > 0
-    joints = varied & ~np.isin(np.round(np.abs(actions), 3), (0.0, 1.0)).all(axis=0)  # a gripper is open or shut
-    at_bound = (np.abs(actions) >= AT_BOUND).mean(axis=0) * joints * (True if free is None else free)
+    moving = varied & ~np.isin(np.round(np.abs(actions), 3), (0.0, 1.0)).all(axis=0)  # a gripper is open or shut
+    at_bound = (np.abs(actions) >= AT_BOUND).mean(axis=0) * moving * (True if free is None else free)
     if (at_bound > TOO_MANY).any():
         which = ", ".join(f"{i} ({at_bound[i]:.0%})" for i in np.flatnonzero(at_bound > TOO_MANY))
         found.append(
             f"Action dimensions at their bounds in many steps: {which}; the bounds may be too narrow (cqn-data bounds)."
         )
-    states = [episode.low_dim for episode in episodes if episode.low_dim is not None]
-    if states and (pauses := suggest(states)).clear and pauses.share > TOO_MANY:
+    states = [episode.low_dim[:, :joints] for episode in episodes if episode.low_dim is not None]
+    if states and states[0].shape[1] and (pauses := suggest(states)).clear and pauses.share > TOO_MANY:
         found.append(
             f"{pauses.share:.0%} of the demonstrated steps stand still; a policy that imitates them stays where it is"
             " (cqn-data filter --auto)."

@@ -24,10 +24,11 @@ from cqn_data.hub_files import Content
 from lerobot_cqn.base_config import RLConfig
 from lerobot_cqn.errors import CQNError, DataError
 from lerobot_cqn.joint_goals import DeltaToGoalProcessorStep
-from lerobot_cqn.model_card import DataFacts, Evaluated, ModelFacts, commands, data_facts
+from lerobot_cqn.model_card import DataFacts, Evaluated, ModelFacts, action_kind, commands, data_facts
 
 from .config import DatasetSettings
 from .demonstrations import load_metadata
+from .metrics import COLUMNS
 from .stages import read_rows
 
 __all__ = ["Found", "find_checkpoint", "look"]
@@ -72,8 +73,8 @@ def find_checkpoint(run: Path, checkpoint: str) -> Found:
         if not digits:
             known = f"it has {', '.join(there)}" if there else "it has none"
             raise DataError(
-                f"No checkpoint '{checkpoint}' in {run}: {known}; give the --output_dir of a run, or a "
-                "`pretrained_model` folder."
+                f"No checkpoint '{checkpoint}' in {run}: {known}; give the --output_dir of a run (and --checkpoint for "
+                "an earlier one), or a `pretrained_model` folder."
             )
         checkpoint = digits[0]
     return Found(folder / checkpoint / "pretrained_model", run)
@@ -106,6 +107,8 @@ def look(
         for name, kind in (("env", EnvConfig), ("robot", RobotConfig), ("teleop", TeleoperatorConfig))
     )
     more = [f"--{name}={str(value).lower()}" for name, value in _schedule(settings).items()]
+    if data is not None and not data.public:
+        more.append("--dataset.root=...")
     results, described = _results(found, films, files)
     return ModelFacts(
         repo_id=repo_id,
@@ -120,6 +123,7 @@ def look(
         tags=tags,
         data=data,
         results=results,
+        origin=_origin(settings),
         curve=CURVE if CURVE in files else None,
         films=[path for path in files if path.endswith(".mp4")],
         files=described | ({DATASET_CARD: "what the demonstrations are"} if DATASET_CARD in files else {}),
@@ -146,7 +150,7 @@ def _load(model: Path) -> tuple[RLConfig, list[tuple[str, str, str, str]]]:
     if "min" not in stats:
         return config, []
     low, high = (np.asarray(stats[end], dtype=np.float64).reshape(-1) for end in ("min", "max"))
-    kinds = ["joint difference" if i in deltas else "as recorded" for i in range(len(low))]
+    kinds = [action_kind(i in deltas, any_changed=bool(deltas)) for i in range(len(low))]
     return config, [
         (str(i), kind, f"{a:.4g}", f"{b:.4g}") for i, (kind, a, b) in enumerate(zip(kinds, low, high, strict=True))
     ]
@@ -190,7 +194,9 @@ def _results(found: Found, films: int, files: dict[str, Content]) -> tuple[list[
         if len(read_rows(path := found.run / f"{table}.csv")) > 0:
             files[f"training/{table}.csv"] = path
             described[f"training/{table}.csv"] = f"every row of the run's {table}"
-    rows = read_rows(found.run / "evaluations.csv")
+    rows = read_rows(judged := found.run / "evaluations.csv")
+    if rows and not {*COLUMNS["evaluations"]} <= {*rows[0]}:
+        raise DataError(f"{judged} is damaged: expected the columns {', '.join(COLUMNS['evaluations'])}.")
     shown = [row for row in rows if int(row["env_steps"]) in (0, found.step)]
     shown = [row for i, row in enumerate(shown) if row["env_steps"] not in [r["env_steps"] for r in shown[i + 1 :]]]
     _draw(found, rows, files)
@@ -225,8 +231,9 @@ def _training(found: Found, settings: Mapping[str, Any]) -> dict[str, str]:
             "Trained with": "lerobot-train, offline", "Updates": str(found.step or settings.get("steps")),
             "Batch size": str(settings.get("batch_size")), "Seed": str(settings.get("seed")),
         }  # fmt: skip
+    first = "offline on the demonstrations, then online" if settings["offline_updates"] else "online"
     rows = {
-        "Trained with": "cqn-train: offline on the demonstrations, then online",
+        "Trained with": f"cqn-train: {first}",
         "Offline updates": str(settings["offline_updates"]),
         "Seed": str(settings.get("seed")),
     }
@@ -244,6 +251,15 @@ def _training(found: Found, settings: Mapping[str, Any]) -> dict[str, str]:
     if changed := _schedule(settings):
         rows["Changed from the preset's schedule"] = ", ".join(f"{k}={v}" for k, v in changed.items())
     return rows
+
+
+def _origin(settings: Mapping[str, Any]) -> str | None:
+    """The policy that training began from: a name on the Hub, or that it was one on a disk."""
+    path = (settings.get("policy") or {}).get("pretrained_path")
+    if not path:
+        return None
+    on_hub = str(path).count("/") == 1 and not str(path).startswith(("/", ".")) and not Path(path).exists()
+    return str(path) if on_hub else "another policy of its author"
 
 
 def _schedule(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -118,7 +118,7 @@ def test_the_card_says_what_the_run_left(hub: HubServer, run: Path) -> None:
     assert "`feature_dim=8`, `hidden_dim=16`" in card
     assert "| Changed from the preset's schedule | batch_size=4, demo_batch_size=4 |" in card
     assert "Recorded scripted demonstrations" in card
-    assert "| shoulder_pan.pos | as recorded |" in card
+    assert "| shoulder_pan.pos | as the robot takes it |" in card
     assert f"lerobot-eval --policy.path={REPO} --env.type=ur5e_station --env.task=click_button" in card
     assert f"cqn-train --policy.path={REPO}" in card
     assert "--dataset.repo_id=user/click_f" in card
@@ -211,6 +211,11 @@ def test_mistakes_are_named_before_anything_is_sent(
     weights.write_bytes(whole[: len(whole) // 2])
     assert "cannot be loaded, so it is not pushed" in failed(capsys, run)
     weights.write_bytes(whole)
+    table = run / "evaluations.csv"
+    kept = table.read_text()
+    table.write_text("garbage\n1,2\n")
+    assert "evaluations.csv is damaged: expected the columns phase, env_steps" in failed(capsys, run)
+    table.write_text(kept)
     monkeypatch.delenv("HF_TOKEN")
     monkeypatch.setenv("HF_TOKEN_PATH", str(tmp_path / "none"))
     monkeypatch.setattr("huggingface_hub.constants.HF_TOKEN_PATH", str(tmp_path / "none"))
@@ -240,6 +245,11 @@ def test_it_loads_back_in_lerobot_eval_and_trains_on(
          "--eval.final_n_episodes=1", "--save_freq=100", "--threads=1")  # fmt: skip
     rows = (tmp_path / "more" / "episodes.csv").read_text().splitlines()
     assert len(rows) == 3
+    main([f"--run={tmp_path / 'more'}", "--repo_id=user/more"])
+    later = hub.files("models", "user/more")["README.md"].decode()
+    assert yaml.safe_load(later.split("---\n")[1])["base_model"] == REPO
+    assert f"continued from [{REPO}]" in later
+    assert "| Trained with | cqn-train: online |" in later
     saved = json.loads((tmp_path / "more/checkpoints/last/pretrained_model/config.json").read_text())
     assert (saved["hidden_dim"], saved["push_to_hub"], saved["repo_id"]) == (16, False, None)
 

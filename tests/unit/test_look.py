@@ -45,6 +45,17 @@ def test_where_the_environment_ends_nothing_is_lost() -> None:
     assert "1 (" in warnings_about(narrow, free=np.array([False, True, True]))[0]
 
 
+def test_objects_that_lie_still_are_no_pauses() -> None:
+    episodes = [demonstration(seed) for seed in range(5)]
+    for episode in episodes:
+        assert episode.low_dim is not None
+        objects = np.repeat(np.clip((np.arange(61) - 40) / 20, 0, 1)[:, None], 3, axis=1)  # carried in the last steps
+        episode.low_dim[:, 2:] = 0.0
+        object.__setattr__(episode, "low_dim", np.concatenate([episode.low_dim * 0.001, objects], axis=1))
+    assert "stand still" in "".join(warnings_about(episodes))
+    assert warnings_about(episodes, joints=3) == []
+
+
 def test_no_demonstrations_no_warnings() -> None:
     assert warnings_about([]) == []
 

@@ -89,6 +89,13 @@ def test_only_a_dataset_on_the_hub_is_linked(public: bool, listed: list[str] | N
     assert ("huggingface.co/datasets/user/demos" in as_readme(given, ENDPOINT)) is public
 
 
+@pytest.mark.parametrize(("origin", "base"), [("user/first", "user/first"), ("another policy of its author", None)])
+def test_a_continued_policy_names_its_origin(origin: str, base: str | None) -> None:
+    given = facts(origin=origin)
+    assert front_matter(given).get("base_model") == base
+    assert origin in as_readme(given, ENDPOINT).partition("## Results")[0]
+
+
 def test_the_result_is_that_of_the_last_evaluation() -> None:
     given = facts(results=[Evaluated("imitation", 3, 10, 0.1, 0.6), Evaluated("online", 45, 50, 0.79, 0.96)])
     metric = front_matter(given)["model-index"][0]["results"][0]["metrics"][0]
