@@ -68,5 +68,5 @@ def test_demo_names_the_command_that_failed(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "cqn_train.demo", f"--output_dir={out}", *TINY]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 2
-    assert "'record' failed" in result.stdout
+    assert result.stderr.startswith("demo: error: 'record' failed")
     assert "Traceback" not in result.stdout + result.stderr
