@@ -162,7 +162,7 @@ def show(summary: dict[str, Any], config: ArmDemoConfig, console: Console) -> No
 
 def main() -> int:
     """Entry of `python -m cqn_train.demo_arm`."""
-    introduction = "CQN on a simulated arm with a simulated person at the operator's page: about 8 minutes"
+    introduction = "CQN on a simulated arm with a simulated person at the operator's page: about 10 minutes"
     return run_once("demo-arm", ArmDemoConfig, introduction, run_demo, show)
 
 
