@@ -28,7 +28,7 @@ class SimPerson:
 
         takes_over_s: simulated seconds of an episode after which it takes the leader, until the task is done; 0: never.
         helps_episodes: how many episodes of the run it does so in, at their beginning; 0: all. A policy that is always
-            helped learns to wait for help.
+            helped meets no failure of its own.
         """
         self.world, self.url, self.takes_over_s = world, url.rstrip("/"), takes_over_s
         self.helps_episodes = helps_episodes
