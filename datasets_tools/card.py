@@ -4,7 +4,6 @@ The part between two marks is written anew by each push; the rest of a card that
 """
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_cqn.schema import NEXT_REWARD, NEXT_SUCCESS, dimension_names
-from lerobot_cqn.story import code, plain, tell
+from lerobot_cqn.story import code, plain, rows_of, tell
 
 from .deltas import ACTION
 from .readme import Readme, union
@@ -204,13 +203,13 @@ def _actions(facts: Facts) -> str:
     for i, name in enumerate(facts.names):
         numbers = (*facts.extremes[:, i], *facts.bounds[:, i])
         rows.append([plain(name), "delta" if name in moved else "absolute", *(f"{v:.4g}" for v in numbers)])
-    table = _rows(["dimension", "action", "min", "max", "lower bound", "upper bound"], rows)
+    table = rows_of(["dimension", "action", "min", "max", "lower bound", "upper bound"], rows)
     return f"{text} Bounds, which training scales to -1 and 1, are {set_by}.\n\n{table}"
 
 
 def _structure(facts: Facts) -> str:
     rows = [[plain(k), dtype, "x".join(map(str, shape))] for k, (dtype, shape) in facts.features.items()]
-    return _rows(["feature", "dtype", "shape"], rows)
+    return rows_of(["feature", "dtype", "shape"], rows)
 
 
 def _use(labels: Labels) -> str:
@@ -227,8 +226,3 @@ lerobot-train --policy.type=cqn {dataset} --output_dir=outputs/cqn
 ```
 
 `--policy.type=cqn` is Coarse-to-fine Q-Network, of the LeRobot plugin `lerobot_policy_cqn`."""
-
-
-def _rows(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -18,7 +18,7 @@ from huggingface_hub import EvalResult, ModelCardData
 from .base_config import RLConfig
 from .joint_goals import converted_deltas
 from .schema import ACTION, dimension_names, read_history
-from .story import code, plain, tell
+from .story import code, plain, rows_of, tell
 
 __all__ = [
     "Commands",
@@ -293,7 +293,7 @@ def _results(facts: ModelFacts) -> str:
         (plain(r.after), f"{r.rate:.2f}", f"{r.successes}/{r.n}", f"{r.low:.2f} - {r.high:.2f}") for r in facts.results
     ]
     text = "Success rate of the deterministic policy over evaluation episodes; one training run."
-    return f"{text}\n\n{_rows(('after', 'success rate', 'successes', '95 % interval (Wilson)'), rows)}"
+    return f"{text}\n\n{rows_of(('after', 'success rate', 'successes', '95 % interval (Wilson)'), rows)}"
 
 
 def _use(facts: ModelFacts) -> str:
@@ -310,7 +310,7 @@ def _use(facts: ModelFacts) -> str:
 def _features(facts: ModelFacts) -> str:
     config, s = facts.config, facts.config.settings
     rows = [(f"`{code(key)}`", "x".join(map(str, f.shape))) for key, f in (config.input_features or {}).items()]
-    text = _rows(("observation", "shape"), rows)
+    text = rows_of(("observation", "shape"), rows)
     text += f"\n\nThe last {s.frame_stack} frames are seen together." if s.frame_stack > 1 else ""
     action = config.action_feature
     size = action.shape[0] if action is not None else 0
@@ -321,7 +321,9 @@ def _features(facts: ModelFacts) -> str:
     if not actions:
         return text + "; its processors hold the bounds."
     margin = f", widened by {s.action_margin:g} of the range on each side" if s.action_margin else ""
-    return f"{text}; these bounds{margin}:\n\n" + _rows(("dimension", "action", "lower bound", "upper bound"), actions)
+    return f"{text}; these bounds{margin}:\n\n" + rows_of(
+        ("dimension", "action", "lower bound", "upper bound"), actions
+    )
 
 
 def _data(facts: ModelFacts) -> str:
@@ -349,7 +351,7 @@ def _training(facts: ModelFacts) -> str:
         "Presets, and every deviation from the paper and from its authors' implementation, are listed in the plugin's "
         "`docs/algorithm.md`; `config.json` has every number."
     )
-    return f"{_rows(('', ''), rows)}\n\n{text}"
+    return f"{rows_of(('', ''), rows)}\n\n{text}"
 
 
 def _files(facts: ModelFacts) -> str:
@@ -362,7 +364,7 @@ def _files(facts: ModelFacts) -> str:
         **dict.fromkeys(facts.films, "an evaluation episode"),
         **facts.files,
     }
-    return _rows(("file", "what"), [(f"`{code(name)}`", plain(what)) for name, what in rows.items()])
+    return rows_of(("file", "what"), [(f"`{code(name)}`", plain(what)) for name, what in rows.items()])
 
 
 def action_kind(changed: bool, *, any_changed: bool) -> str:
@@ -385,8 +387,3 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:  # run from a folder, never installed
             continue
     return found
-
-
-def _rows(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-__all__ = ["code", "plain", "tell", "told"]
+__all__ = ["code", "plain", "rows_of", "tell", "told"]
 
 MOST = 20  # numbers of episodes named in full
 
@@ -138,3 +138,9 @@ def plain(value: str) -> str:
 def code(value: str) -> str:
     """One line to stand between backticks."""
     return " ".join(value.replace("`", "'").replace("<!--", "< !--").split())
+
+
+def rows_of(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown; cells stand as they are."""
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -92,6 +92,13 @@ class Agent:
             return None
         return torch.cat([prepared[key] for key in self.policy.low_dim_keys], dim=-1).float().cpu().numpy()
 
+    def ranges(self, key: str) -> NDArray[Any] | None:
+        """`min` and `max` [2, K] of a feature in the statistics that the policy scales by; None where it has none."""
+        for step in self.postprocessor.steps:  # the preprocessor's give a constant joint a range of two units
+            if isinstance(step, UnnormalizerProcessorStep) and "min" in (entry := (step.stats or {}).get(key, {})):
+                return np.stack([np.asarray(entry[name], dtype=np.float64).reshape(-1) for name in ("min", "max")])
+        return None
+
     def inside(self, bounds: Mapping[str, NDArray[Any]] | None) -> NDArray[Any]:
         """Which action dimensions [D] end before the environment's bounds (`min`, `max`) do: more is possible."""
         (scale,) = (step for step in self.postprocessor.steps if isinstance(step, UnnormalizerProcessorStep))

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from lerobot.configs.types import FeatureType
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.processor import UnnormalizerProcessorStep
 from lerobot.robots.robot import Robot
 from lerobot.robots.utils import make_robot_from_config
 from lerobot.teleoperators.utils import make_teleoperator_from_config
@@ -147,7 +146,7 @@ def limits_of(robot: Robot, agent: Agent, settings: ArmSettings, fps: int) -> Li
     for name in (*settings.joint_limits, *settings.home):
         if name not in names:
             raise ConfigError(one_of("joint", name, names))
-    action, state = _ranges(agent, ACTION), _ranges(agent, OBS_STATE)
+    action, state = agent.ranges(ACTION), agent.ranges(OBS_STATE)
     deltas = agent.deltas
     low: Array = np.zeros(len(names))
     high, step = low.copy(), low.copy()
@@ -218,14 +217,6 @@ def _check_names(robot: Robot, features: dict[str, Any]) -> None:
         names = features.get(key, {}).get("names")
         if isinstance(names, list | tuple) and list(names) != own:
             raise DataError(f"The dataset's {key} is {list(names)}, the robot's {own}: use the robot of the dataset.")
-
-
-def _ranges(agent: Agent, key: str) -> Array | None:
-    """`min` and `max` [2, K] of a feature in the policy's statistics."""
-    for step in agent.postprocessor.steps:  # the preprocessor's give a constant joint a range of two units
-        if isinstance(step, UnnormalizerProcessorStep) and "min" in (entry := (step.stats or {}).get(key, {})):
-            return np.stack([np.asarray(entry[name], dtype=np.float64).reshape(-1) for name in ("min", "max")])
-    return None
 
 
 def _forward(robot: Robot, settings: ArmSettings) -> Forward:

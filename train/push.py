@@ -3,7 +3,7 @@
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from huggingface_hub import constants
@@ -111,16 +111,13 @@ def check_account(repo_id: str) -> str | None:
 
 def again(config: PushConfig) -> str:
     """The command that pushes like this once more."""
-    given = [
-        ("private", "true" if config.private else ""),
-        ("license", config.license),
-        ("tags", f"[{', '.join(config.tags)}]" if config.tags else ""),
-        ("branch", config.branch),
-        ("message", config.message),
-        ("dataset", config.dataset),
-        ("checkpoint", config.checkpoint if config.checkpoint != "last" else ""),
-    ]
-    more = [f"--{name}={value}" for name, value in given if value]
+    more = []
+    for option_ in fields(config):
+        value = getattr(config, option_.name)
+        if option_.name in ("run", "repo_id", "dry_run") or value in (option_.default, []):
+            continue
+        text = f"[{', '.join(value)}]" if isinstance(value, list) else str(value)
+        more.append(f"--{option_.name}={text.lower() if isinstance(value, bool) else text}")
     return shlex.join([TOOL, f"--run={config.run}", f"--repo_id={config.repo_id}", *more])
 
 

@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import draccus
-import numpy as np
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-from lerobot.processor import UnnormalizerProcessorStep
 from lerobot.robots.config import RobotConfig
 from lerobot.teleoperators.config import TeleoperatorConfig
 from lerobot.utils.constants import ACTION
@@ -23,9 +21,9 @@ from cqn_data.console import note
 from cqn_data.hub_files import Content
 from lerobot_cqn.base_config import RLConfig
 from lerobot_cqn.errors import CQNError, DataError
-from lerobot_cqn.joint_goals import DeltaToGoalProcessorStep
 from lerobot_cqn.model_card import DataFacts, Evaluated, ModelFacts, action_kind, commands, data_facts
 
+from .agent import Agent
 from .config import DatasetSettings
 from .demonstrations import load_metadata
 from .metrics import COLUMNS
@@ -138,21 +136,20 @@ def _load(model: Path) -> tuple[RLConfig, list[tuple[str, str, str, str]]]:
             raise DataError(f"{model} holds a policy of type '{config.type}': push it with LeRobot.")
         config.device = "cpu"
         with contextlib.redirect_stdout(io.StringIO()):  # it says where it loads from
-            get_policy_class(config.type).from_pretrained(model, config=config)
-        _, post = make_pre_post_processors(config, pretrained_path=str(model))
+            policy: Any = get_policy_class(config.type).from_pretrained(model, config=config)
+        agent = Agent(policy, *make_pre_post_processors(config, pretrained_path=str(model)))
     except CQNError:
         raise
     except Exception as error:  # draccus, safetensors and torch raise kinds of their own
         said = " ".join(str(error).split())[:200]
         raise DataError(f"The checkpoint in {model} cannot be loaded, so it is not pushed: {said}") from error
-    stats = next((s.stats or {} for s in post.steps if isinstance(s, UnnormalizerProcessorStep)), {}).get(ACTION, {})
-    deltas = next((s.deltas.action_dims for s in post.steps if isinstance(s, DeltaToGoalProcessorStep)), ())
-    if "min" not in stats:
+    bounds, deltas = agent.ranges(ACTION), () if agent.deltas is None else agent.deltas.action_dims
+    if bounds is None:
         return config, []
-    low, high = (np.asarray(stats[end], dtype=np.float64).reshape(-1) for end in ("min", "max"))
-    kinds = [action_kind(i in deltas, any_changed=bool(deltas)) for i in range(len(low))]
+    kinds = [action_kind(i in deltas, any_changed=bool(deltas)) for i in range(bounds.shape[1])]
     return config, [
-        (str(i), kind, f"{a:.4g}", f"{b:.4g}") for i, (kind, a, b) in enumerate(zip(kinds, low, high, strict=True))
+        (str(i), kind, f"{low:.4g}", f"{high:.4g}")
+        for i, (kind, low, high) in enumerate(zip(kinds, *bounds, strict=True))
     ]
 
 
@@ -197,18 +194,18 @@ def _results(found: Found, films: int, files: dict[str, Content]) -> tuple[list[
     rows = read_rows(judged := found.run / "evaluations.csv")
     if rows and not {*COLUMNS["evaluations"]} <= {*rows[0]}:
         raise DataError(f"{judged} is damaged: expected the columns {', '.join(COLUMNS['evaluations'])}.")
-    shown = [row for row in rows if int(row["env_steps"]) in (0, found.step)]
-    shown = [row for i, row in enumerate(shown) if row["env_steps"] not in [r["env_steps"] for r in shown[i + 1 :]]]
+    # Of several at the same step the last.
+    shown = {int(row["env_steps"]): row for row in rows if int(row["env_steps"]) in (0, found.step)}
     _draw(found, rows, files)
-    stems = [f"{row['phase']}_{int(row['env_steps']):06d}" for row in rows if int(row["env_steps"]) == found.step]
-    for path in sorted(found.run.glob(f"videos/{stems[-1]}_*.mp4"))[:films] if stems else ():
-        files[f"videos/{path.name}"] = path
+    if found.step in shown:
+        stem = f"{shown[found.step]['phase']}_{found.step:06d}"
+        files |= {f"videos/{path.name}": path for path in sorted(found.run.glob(f"videos/{stem}_*.mp4"))[:films]}
     return [
         Evaluated(
             f"{row['updates']} updates, {row['env_steps']} steps online",
             int(row["successes"]), int(row["n"]), float(row["ci_low"]), float(row["ci_high"]),
         )
-        for row in shown
+        for row in shown.values()
     ], described  # fmt: skip
 
 
