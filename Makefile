@@ -14,10 +14,10 @@ help: ## show the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: ## see it work: a small training run with its report, in outputs/demo
-	@$(RUN) .venv/bin/python -m cqn_train.demo --output_dir=outputs/demo $(ARGS)
+	@$(RUN) .venv/bin/python -m cqn_train.demo.station --output_dir=outputs/demo $(ARGS)
 
 demo-arm: ## the same on a simulated arm: lerobot-record, the operator's page, a simulated person; in outputs/demo-arm
-	@$(RUN) .venv/bin/python -m cqn_train.demo_arm --output_dir=outputs/demo-arm $(ARGS)
+	@$(RUN) .venv/bin/python -m cqn_train.demo.arm --output_dir=outputs/demo-arm $(ARGS)
 
 test: ## the fast tests
 	@$(RUN) .venv/bin/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)

@@ -24,8 +24,8 @@ import numpy as np
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from cqn_data.pictures import shaped, video_pictures
-from cqn_data.view import Camera
+from cqn_data.disk.pictures import shaped, video_pictures
+from cqn_data.views.view import Camera
 
 from .results_table import append
 

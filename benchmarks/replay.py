@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from cqn_train.replay import Episode, Replay
+from cqn_train.replay.buffer import Episode, Replay
 
 from .results_table import append
 

@@ -10,14 +10,14 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
-from types import FrameType
+from types import FrameType, ModuleType
 
-from .console import Interrupted, explain, note, quiet, result
+from .terminal.console import Interrupted, explain, note, quiet, result
 
-__all__ = ["OPERATIONS", "main"]
+__all__ = ["OPERATIONS", "main", "module_of"]
 
-# Operation -> one line for --help. Each lives in the module of its name and offers help() and main(args); an int that
-# main returns is the exit code.
+# Operation -> one line for --help. Each lives in the module that MODULES names, else in that of its name in operations/,
+# and offers help() and main(args); an int that main returns is the exit code.
 OPERATIONS = {
     "convert": "turn RLBench, robomimic, ALOHA, diffusion_policy, NPZ or LeRobot v2.1 data into a LeRobotDataset v3",
     "inspect": "look at a dataset before training: pauses, cameras, outliers, what is missing",
@@ -32,6 +32,14 @@ OPERATIONS = {
     "drop": "leave out whole episodes, by number or by rule",
     "run": "run several of these as one pass over the videos, from a recipe",
     "push": "upload a dataset to the Hugging Face Hub, with a card that tells how it came about",
+}
+
+MODULES = {
+    "convert": "formats.convert",
+    "inspect": "inspection.inspect",
+    "record": "record",
+    "run": "operations.recipe",
+    "push": "hub.push",
 }
 
 
@@ -69,12 +77,17 @@ def _run(name: str, args: list[str]) -> int:
         from lerobot_cqn.errors import ConfigError, one_of
 
         raise ConfigError(one_of("operation", name, OPERATIONS))
-    module = importlib.import_module(f".{name}", __package__)
+    module = module_of(name)
     if "-h" in args or "--help" in args:
         result(module.help())
         return 0
     code = module.main(args)
     return code if isinstance(code, int) else 0
+
+
+def module_of(name: str) -> ModuleType:
+    """The module of an operation."""
+    return importlib.import_module(f".{MODULES.get(name, f'operations.{name}')}", __package__)
 
 
 def _overview() -> str:

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from .console import Interrupted, load_lerobot, note, progress, result
-from .options import help_page, option, parse
+from .terminal.console import Interrupted, load_lerobot, note, progress, result
+from .terminal.options import help_page, option, parse
 
 __all__ = ["RecordConfig", "ScriptedTeleoperator", "help", "main", "record_dataset"]
 
@@ -103,8 +103,8 @@ def record_dataset(config: RecordConfig, env_config: Any) -> None:
         Interrupted: Ctrl-C; the episodes before are saved.
     """
     config.validate()
-    from .source import local_root
-    from .target import new_dataset, refuse_existing, write_history
+    from .disk.source import local_root
+    from .disk.target import new_dataset, refuse_existing, write_history
 
     root = local_root(config.repo_id, config.root)
     refuse_existing(root)

@@ -19,12 +19,12 @@ from typing import Any
 
 from lerobot.envs.configs import EnvConfig
 
-from cqn_data.cli import OPERATIONS
-from cqn_data.job import Job
-from cqn_data.run import STEPS
-from cqn_train import bench
+from cqn_data.cli import OPERATIONS, module_of
+from cqn_data.operations.job import Job
+from cqn_data.operations.recipe import STEPS
 from cqn_train import config as run
 from cqn_train import envs as _envs  # noqa: F401  # registers the environments
+from cqn_train.bench import cli as bench
 from cqn_train.robot.settings import ArmSettings
 from cqn_train.sim_arm import FAULTS, SimLeaderConfig, SimUR5eConfig
 from lerobot_cqn.base_config import RLConfig
@@ -326,7 +326,7 @@ def dataset_tools() -> list[str]:
         options(rows(Job)),
     ]
     for name, summary in OPERATIONS.items():
-        module = importlib.import_module(f"cqn_data.{name}")
+        module = module_of(name)
         found = [rows(kind) for kind in vars(module).values() if _holds_options(kind, module.__name__)]
         parts += [f"### `cqn-data {name}`", summary[0].upper() + summary[1:] + "."]
         parts += [options(entries) for entries in found]
@@ -343,7 +343,7 @@ def _holds_options(kind: Any, module: str) -> bool:
 
 def pushing() -> list[str]:
     """Section on `cqn-push`."""
-    from cqn_train.push import PushConfig
+    from cqn_train.push.cli import PushConfig
 
     return ["## `cqn-push`", "Sends a run's policy to the Hugging Face Hub, with a card.", options(rows(PushConfig))]
 
@@ -356,7 +356,7 @@ def comparisons() -> list[str]:
 def page() -> str:
     """The whole page."""
     parts = [INTRODUCTION.rstrip(), *training(), *policies(), *worlds(), *dataset_tools()]
-    if importlib.util.find_spec("cqn_train.push"):
+    if importlib.util.find_spec("cqn_train.push.cli"):
         parts += pushing()
     parts += comparisons()
     return "\n\n".join(parts) + "\n"

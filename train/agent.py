@@ -20,7 +20,7 @@ from lerobot_cqn.errors import DataError
 from lerobot_cqn.joint_goals import DeltaJoints, DeltaToGoalProcessorStep
 
 from .interfaces import Frame, Outcome
-from .replay import Episode
+from .replay.buffer import Episode
 
 __all__ = ["Agent", "Recorder"]
 

@@ -21,10 +21,10 @@ from lerobot.teleoperators.config import TeleoperatorConfig
 
 from lerobot_cqn.errors import ConfigError, CQNError, one_of
 
-from .checkpoint import last_checkpoint
+from .arm.devices import register_devices
 from .config import DatasetSettings, EvalSettings, PageSettings, ReplaySettings, RunConfig, WandBSettings
-from .devices import register_devices
 from .robot.settings import ArmSettings
+from .run.checkpoint import last_checkpoint
 
 __all__ = ["introduction", "parse"]
 

@@ -24,7 +24,7 @@ from lerobot.policies.factory import get_policy_class, make_policy, make_pre_pos
 from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from cqn_data.console import explain
+from cqn_data.terminal.console import explain
 from lerobot_cqn.base_config import RLConfig
 from lerobot_cqn.base_policy import RLPolicy
 from lerobot_cqn.errors import ConfigError, CQNError, OutputExistsError
@@ -34,19 +34,19 @@ from lerobot_cqn.learner import Learner
 from . import envs  # noqa: F401  # registers our environments
 from .agent import Agent
 from .arguments import introduction, parse
-from .arm_parts import Operated, make_operated, recall, steering
-from .checkpoint import Counters, last_checkpoint, restore, save, seed_everything
+from .arm.build import Operated, make_operated, recall, steering
+from .arm.devices import register_devices
 from .config import RunConfig
-from .console import ConsoleMonitor, Monitors
-from .demonstrations import load_episodes, load_metadata
-from .devices import register_devices
-from .gym_env import GymEnvironment, GymScenes, OneScene
 from .interfaces import Environment, Interrupted, Scenes
-from .look import draw_batch, warnings_about
-from .metrics import Log, Metrics, start_tensorboard, start_wandb
-from .online import Monitor, Nobody, Trainer
-from .push import PushConfig, check_account, push
-from .replay import Episode, Replay
+from .loop.gym_env import GymEnvironment, GymScenes, OneScene
+from .loop.trainer import Monitor, Nobody, Trainer
+from .push.cli import PushConfig, check_account, push
+from .replay.buffer import Episode, Replay
+from .replay.demonstrations import load_episodes, load_metadata
+from .run.checkpoint import Counters, last_checkpoint, restore, save, seed_everything
+from .run.first_look import draw_batch, warnings_about
+from .run.metrics import Log, Metrics, start_tensorboard, start_wandb
+from .run.progress import ConsoleMonitor, Monitors
 
 __all__ = ["main"]
 

@@ -9,7 +9,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.robots.config import RobotConfig
 from lerobot.teleoperators.config import TeleoperatorConfig
 
-from cqn_data.hub_options import check_repo_id
+from cqn_data.hub.options import check_repo_id
 from lerobot_cqn.base_config import RLConfig
 from lerobot_cqn.errors import ConfigError, one_of
 

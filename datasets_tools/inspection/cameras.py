@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..source import Source
-from ..view import Camera
+from ..disk.source import Source
+from ..views.view import Camera
 
 if TYPE_CHECKING:
     from .numbers import EpisodeNumbers

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.errors import DataError
 
-from ..readable import match_joints
-from ..source import Source
+from ..disk.source import Source
+from ..views.readable import match_joints
 
 __all__ = ["Correlation", "Follow", "FollowKind"]
 

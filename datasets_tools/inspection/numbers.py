@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from lerobot_cqn.errors import DataError
 from lerobot_cqn.schema import ACTION, NEXT_REWARD, NEXT_SUCCESS, dimension_names
 
-from ..pauses import pause_runs
-from ..source import Source
-from ..threshold import Motion, Suggestion
-from ..view import Episode, gripper_dims
+from ..decisions.pause_threshold import Motion, Suggestion
+from ..decisions.pauses import pause_runs
+from ..disk.source import Source
+from ..views.view import Episode, gripper_dims
 from .follow import Follow
 
 __all__ = ["DRAWN", "Dimension", "EpisodeNumbers", "Jump", "Numbers", "measure"]

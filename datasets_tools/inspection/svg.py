@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..threshold import Suggestion
+from ..decisions.pause_threshold import Suggestion
 from .numbers import DRAWN, EpisodeNumbers
 
 __all__ = ["pauses", "spark", "still_share", "threshold_histogram"]

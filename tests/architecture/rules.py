@@ -25,7 +25,7 @@ ROOM_MAY_USE: dict[str, tuple[str, ...]] = {
 }
 
 # --- Parts of `train` that know neither one another nor the loop: they meet in the modules named here.
-SEPARATE_PARTS = ("train.envs", "train.robot", "train.operator_page")
+SEPARATE_PARTS = ("train.envs", "train.robot", "train.operator")
 MEETING_PLACE = "train.interfaces"
 
 # --- Inside lerobot_cqn: each module and the siblings it may import.

@@ -66,12 +66,12 @@ def test_constraints_are_plain_pins():
 OFFENCES = [
     ("check_rooms", "lerobot_cqn/critic.py", "import cqn_train.loop"),
     ("check_rooms", "lerobot_cqn/critic.py", "def f():\n    from cqn_data import cli"),
-    ("check_rooms", "lerobot_cqn/_plugin/__init__.py", "import cqn_train.online"),
+    ("check_rooms", "lerobot_cqn/_plugin/__init__.py", "import cqn_train.loop.trainer"),
     ("check_rooms", "lerobot_cqn/__init__.py", "from . import _plugin"),
-    ("check_rooms", "datasets_tools/trim.py", "import cqn_train"),
-    ("check_rooms", "datasets_tools/trim.py", "from lerobot_cqn import learner"),
-    ("check_rooms", "train/online.py", "import lerobot_policy_cqn"),
-    ("check_relative", "train/online.py", "from cqn_train.replay import Replay"),
+    ("check_rooms", "datasets_tools/operations/trim.py", "import cqn_train"),
+    ("check_rooms", "datasets_tools/operations/trim.py", "from lerobot_cqn import learner"),
+    ("check_rooms", "train/loop/trainer.py", "import lerobot_policy_cqn"),
+    ("check_relative", "train/loop/trainer.py", "from cqn_train.replay.buffer import Replay"),
     ("check_relative", "datasets_tools/cli.py", "import datasets_tools.trim"),
     ("check_installed_names", "train/cli.py", "from datasets_tools import trim"),
     ("check_installed_names", "tests/unit/test_x.py", "import train.replay"),
@@ -80,16 +80,16 @@ OFFENCES = [
     ("check_layers", "lerobot_cqn/critic.py", "from . import learner"),
     ("check_layers", "lerobot_cqn/critic.py", "import lerobot_cqn"),
     ("check_layers", "lerobot_cqn/novelty.py", ""),
-    ("check_separate_parts", "train/envs/station.py", "from ..online import run"),
+    ("check_separate_parts", "train/envs/ur5e_station/station.py", "from ...loop.trainer import run"),
     ("check_separate_parts", "train/robot/arm.py", "from .. import envs"),
-    ("check_separate_parts", "train/operator_page/web.py", "def f():\n    from ..robot import arm"),
-    ("check_optional", "train/online.py", "try:\n    import wandb\nexcept ImportError:\n    wandb = None"),
-    ("check_optional", "train/report.py", "class A:\n    from matplotlib import pyplot"),
-    ("check_forbidden", "train/checkpoint.py", "x = eval('1')"),
-    ("check_forbidden", "train/checkpoint.py", "def f(p):\n    return pickle.load(p)"),
-    ("check_forbidden", "train/checkpoint.py", "torch.load(p, weights_only=False)"),
-    ("check_forbidden", "train/checkpoint.py", "subprocess.run('ls', shell=True)"),
-    ("check_length", "train/online.py", "x = 1\n" * (rules.MAX_LINES + 1)),
+    ("check_separate_parts", "train/operator/web.py", "def f():\n    from ..robot import arm"),
+    ("check_optional", "train/loop/trainer.py", "try:\n    import wandb\nexcept ImportError:\n    wandb = None"),
+    ("check_optional", "train/demo/report.py", "class A:\n    from matplotlib import pyplot"),
+    ("check_forbidden", "train/run/checkpoint.py", "x = eval('1')"),
+    ("check_forbidden", "train/run/checkpoint.py", "def f(p):\n    return pickle.load(p)"),
+    ("check_forbidden", "train/run/checkpoint.py", "torch.load(p, weights_only=False)"),
+    ("check_forbidden", "train/run/checkpoint.py", "subprocess.run('ls', shell=True)"),
+    ("check_length", "train/loop/trainer.py", "x = 1\n" * (rules.MAX_LINES + 1)),
 ]
 FINE = [
     (
@@ -97,16 +97,16 @@ FINE = [
         "from .networks import Stream\nfrom lerobot_cqn.schema import Batch",
     ),
     ("lerobot_cqn/_plugin/__init__.py", "import cqn_train.envs\nimport lerobot_cqn"),
-    ("datasets_tools/trim.py", "from lerobot_cqn.errors import DataError\nfrom lerobot_cqn import schema"),
-    ("datasets_tools/trim.py", "from .reading import episodes"),
+    ("datasets_tools/operations/trim.py", "from lerobot_cqn.errors import DataError\nfrom lerobot_cqn import schema"),
+    ("datasets_tools/operations/trim.py", "from .reading import episodes"),
     (
-        "train/online.py",
+        "train/loop/trainer.py",
         "from cqn_data import cli\nfrom lerobot_cqn import learner\nfrom .envs import x",
     ),
-    ("train/envs/station.py", "from ..interfaces import Task\nfrom .task import Goal"),
-    ("train/envs/station.py", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import mujoco"),
-    ("train/report.py", "def draw():\n    import matplotlib.pyplot as plt"),
-    ("train/online.py", "critic.eval()\ntorch.load(p, weights_only=True)"),
+    ("train/envs/ur5e_station/station.py", "from ...interfaces import Task\nfrom .task import Goal"),
+    ("train/envs/ur5e_station/station.py", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import mujoco"),
+    ("train/demo/report.py", "def draw():\n    import matplotlib.pyplot as plt"),
+    ("train/loop/trainer.py", "critic.eval()\ntorch.load(p, weights_only=True)"),
 ]
 
 
@@ -130,10 +130,12 @@ def test_what_is_allowed_passes(tmp_path, name, text):
     assert not _problems(rules.ROOM_CHECKS + rules.EVERYWHERE_CHECKS, [_source(tmp_path, name, text)])
 
 
-@pytest.mark.parametrize("text", ["from .envs import station", "from .envs.station import Station"])
+@pytest.mark.parametrize(
+    "text", ["from .envs.ur5e_station import station", "from .envs.ur5e_station.station import Station"]
+)
 def test_module_that_needs_an_extra_is_imported_on_use(tmp_path, monkeypatch, text):
-    monkeypatch.setattr(rules, "IMPORTED_ON_USE", frozenset({"train.envs.station"}))
-    station = _source(tmp_path, "train/envs/station.py", "import mujoco")
+    monkeypatch.setattr(rules, "IMPORTED_ON_USE", frozenset({"train.envs.ur5e_station.station"}))
+    station = _source(tmp_path, "train/envs/ur5e_station/station.py", "import mujoco")
     assert not _problems((rules.check_optional,), [station])
-    user = _source(tmp_path / "other", "train/online.py", text)
+    user = _source(tmp_path / "other", "train/build.py", text)
     assert len(_problems((rules.check_optional,), [user])) == 1

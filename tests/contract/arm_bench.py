@@ -12,10 +12,10 @@ import torch
 from lerobot.robots import make_robot_from_config
 from numpy.typing import NDArray
 
-from cqn_train.arm_env import ArmEnvironment
-from cqn_train.envs.ur5e import HOME
+from cqn_train.arm.environment import ArmEnvironment
+from cqn_train.envs.ur5e_station.ur5e import HOME
 from cqn_train.interfaces import Outcome
-from cqn_train.operator_page.session import Event, RefusedError, Session, State
+from cqn_train.operator.session import Event, RefusedError, Session, State
 from cqn_train.robot.arm import Arm
 from cqn_train.robot.guard import Guard, GuardSettings
 from cqn_train.robot.limits import Limits

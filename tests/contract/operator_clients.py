@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cqn_train.operator_page.board import Board
-from cqn_train.operator_page.session import Session
+from cqn_train.operator.board import Board
+from cqn_train.operator.session import Session
 
 pytest.importorskip("fastapi", reason="needs the extra [page]")
 pytest.importorskip("httpx", reason="needs the extra [dev]")
@@ -16,8 +16,8 @@ pytest.importorskip("httpx", reason="needs the extra [dev]")
 from fastapi.testclient import TestClient
 from websockets.sync.client import connect
 
-from cqn_train.operator_page.control import Control
-from cqn_train.operator_page.server import OperatorServer, make_app
+from cqn_train.operator.control import Control
+from cqn_train.operator.page.server import OperatorServer, make_app
 
 TOKEN = "a-token-of-the-test"  # noqa: S105
 ANN = {"X-Token": TOKEN, "X-Client": "ann"}

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cqn_train.operator_page.session import Event, State
+from cqn_train.operator.session import Event, State
 
 from .arm_bench import FPS, HOME_DEG, STEP_DEG, SWING_DEG, Bench, bench, soon
 

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from cqn_train.cli import main
-from cqn_train.storage import Journal
+from cqn_train.replay.files import Journal
 
 from .conftest import TINY_POLICY, Command
 from .terminal import record_demonstrations

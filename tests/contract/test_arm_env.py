@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cqn_train.interfaces import Interrupted, Label
-from cqn_train.operator_page.session import Event, State
+from cqn_train.operator.session import Event, State
 
 from .arm_bench import FPS, STEP_DEG, Bench, bench, soon
 

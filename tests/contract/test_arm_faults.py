@@ -6,9 +6,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from cqn_train import attendant
+from cqn_train.arm import attendant
 from cqn_train.interfaces import Interrupted, Label, Outcome
-from cqn_train.operator_page.session import Event, State
+from cqn_train.operator.session import Event, State
 from cqn_train.robot.guard import RobotFault
 from cqn_train.sim_arm import FAULTS, Fault
 

@@ -14,16 +14,16 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from cqn_train import cli
 from cqn_train.arguments import parse
-from cqn_train.arm_env import ArmEnvironment
+from cqn_train.arm.environment import ArmEnvironment
 from cqn_train.cli import build
-from cqn_train.console import ConsoleMonitor
 from cqn_train.interfaces import Interrupted, Label
-from cqn_train.online import Trainer
-from cqn_train.operator_page.session import Event, RefusedError, Session, State
+from cqn_train.loop.trainer import Trainer
+from cqn_train.operator.session import Event, RefusedError, Session, State
+from cqn_train.replay.files import Place
+from cqn_train.run.progress import ConsoleMonitor
 from cqn_train.sim_arm import SimUR5eConfig
 from cqn_train.sim_arm.sim_ur5e import SimUR5e
 from cqn_train.sim_arm.world import WORLDS
-from cqn_train.storage import Place
 
 from .arm_bench import FPS, HOME_DEG, RAMP_S, SPEED, soon
 from .conftest import TINY_POLICY

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cqn_train.bench import load_plan, main, runs_of
-from cqn_train.bench_report import aggregate
+from cqn_train.bench.cli import load_plan, main, runs_of
+from cqn_train.bench.report import aggregate
 from lerobot_cqn.errors import ConfigError
 
 from .conftest import STATION, TINY_POLICY
@@ -34,7 +34,7 @@ def plan(click: list[str], tmp_path: Path) -> Path:
 
 def test_runs_once_continues_what_was_killed_and_reports(plan: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "cqn_train.bench", str(plan), f"--output_dir={out}", "--processes=2"]
+    command = [sys.executable, "-m", "cqn_train.bench.cli", str(plan), f"--output_dir={out}", "--processes=2"]
     first = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     deadline = time.monotonic() + 120
     while not (out / "click" / "cqn" / "1" / "checkpoints" / "last").exists():

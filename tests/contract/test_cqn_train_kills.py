@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from cqn_train.cli import main
-from cqn_train.storage import Journal, Place
+from cqn_train.replay.files import Journal, Place
 
 from .conftest import TINY_RUN
 from .test_cqn_train import assert_same_run, tables

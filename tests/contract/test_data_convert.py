@@ -119,7 +119,7 @@ def test_a_missing_package_is_named_with_its_remedy(tmp_path, target, capsys, mo
 
 
 def test_a_failure_while_writing_leaves_nothing(tmp_path, target, capsys, monkeypatch):
-    from cqn_data.target import Target
+    from cqn_data.disk.target import Target
 
     write_npz(tmp_path / "takes", fps=30)
     saved = Target.save_episode

@@ -14,9 +14,9 @@ import pytest
 from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
 
 from cqn_data.cli import main
-from cqn_data.inspect import as_json, inspect_dataset
+from cqn_data.disk.source import open_source
 from cqn_data.inspection.checks import GIB
-from cqn_data.source import open_source
+from cqn_data.inspection.inspect import as_json, inspect_dataset
 from lerobot_cqn.errors import DataError
 
 from .recordings import (

@@ -12,10 +12,10 @@ import pytest
 import yaml
 from huggingface_hub import HfApi, close_session
 
-from cqn_data import hub as hub_module
-from cqn_data.card import TOOL
 from cqn_data.cli import main
-from cqn_data.readme import end_mark, start_mark
+from cqn_data.hub import client as hub_module
+from cqn_data.hub.card import TOOL
+from cqn_data.hub.readme import end_mark, start_mark
 
 from ..hub_server import TOKEN, HubServer
 from ..toy_datasets import CAMERA, make_dataset
@@ -224,7 +224,7 @@ def test_a_commit_whose_answer_is_lost_is_not_made_twice(prepared, hub):
 
 
 def test_a_push_that_broke_off_goes_on_where_it_was(prepared, hub, capsys, monkeypatch):
-    monkeypatch.setattr("cqn_data.hub_files.BATCH_FILES", 1)
+    monkeypatch.setattr("cqn_data.hub.files.BATCH_FILES", 1)
     video = next(p for p in content(prepared) if p.endswith(".mp4"))
     hub.fail("PUT", hashlib.sha256((prepared / video).read_bytes()).hexdigest(), None, times=10**6)
     line = failed(capsys, prepared)

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from cqn_data import source as source_module
+from cqn_data.disk import source as source_module
 
 from .data_recording import LENGTHS, RECIPE, TOP, column, history, last_line, run, videos, what
 

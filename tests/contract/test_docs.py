@@ -15,14 +15,14 @@ from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from cqn_data.cli import OPERATIONS
-from cqn_data.job import Job
-from cqn_data.options import parse, parse_all
-from cqn_data.run import STEPS, load_recipe
+from cqn_data.cli import OPERATIONS, module_of
+from cqn_data.operations.job import Job
+from cqn_data.operations.recipe import STEPS, load_recipe
+from cqn_data.terminal.options import parse, parse_all
 from cqn_train import arguments as cqn_train
-from cqn_train import bench
-from cqn_train.devices import register_devices
-from cqn_train.push import PushConfig
+from cqn_train.arm.devices import register_devices
+from cqn_train.bench import cli as bench
+from cqn_train.push.cli import PushConfig
 from lerobot_cqn.configuration_cqn import CQNConfig
 from lerobot_cqn.errors import CQNError
 
@@ -131,7 +131,7 @@ def check_cqn_data(words: Sequence[str]) -> None:
     """Parse with the operation's own options and validate them."""
     operation, *options = words
     assert operation in OPERATIONS, operation
-    module = importlib.import_module(f"cqn_data.{operation}")
+    module = module_of(operation)
     if operation == "run":
         recipe, *options = options
         steps = [

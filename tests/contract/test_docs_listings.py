@@ -20,8 +20,8 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from cqn_data.cli import main as cqn_data
 from cqn_train import cli
 from cqn_train.cli import main as cqn_train
-from cqn_train.operator_page.session import Event
-from cqn_train.push import main as cqn_push
+from cqn_train.operator.session import Event
+from cqn_train.push.cli import main as cqn_push
 
 from .conftest import TINY_POLICY
 from .documents import ROOT, Command, commands, listings

@@ -14,8 +14,8 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
 from cqn_train.agent import Agent
 from cqn_train.cli import main
-from cqn_train.evaluate import evaluate
-from cqn_train.gym_env import GymEnvironment, GymScenes, OneScene
+from cqn_train.loop.evaluate import evaluate
+from cqn_train.loop.gym_env import GymEnvironment, GymScenes, OneScene
 
 from .conftest import STATION, TINY_RUN, Command
 

@@ -345,7 +345,7 @@ def test_an_environment_without_a_time_limit_is_refused(tmp_path: Path, monkeypa
     import gymnasium as gym
 
     from cqn_train.arguments import parse
-    from cqn_train.gym_env import GymEnvironment
+    from cqn_train.loop.gym_env import GymEnvironment
 
     name = make_package(tmp_path / "lib", "endless", monkeypatch)
     config = parse([f"--env.discover_packages_path={name}", "--env.type=endless", *TINY_POLICY])

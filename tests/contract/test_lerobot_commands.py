@@ -18,7 +18,7 @@ from torch import Tensor
 
 from cqn_train.agent import Agent
 from cqn_train.cli import StopRequest, build, parse
-from cqn_train.console import ConsoleMonitor
+from cqn_train.run.progress import ConsoleMonitor
 from lerobot_cqn.intervals import snap
 
 from .conftest import STATION, TINY_POLICY, TINY_RUN, Command

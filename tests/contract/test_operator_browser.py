@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cqn_train.operator_page.board import Board
-from cqn_train.operator_page.session import Event, Label, Session, State
+from cqn_train.operator.board import Board
+from cqn_train.operator.session import Event, Label, Session, State
 
 pytest.importorskip("fastapi", reason="needs the extra [page]")
 playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra [dev]")
 
-from cqn_train.operator_page.server import OperatorServer  # noqa: E402
+from cqn_train.operator.page.server import OperatorServer  # noqa: E402
 
 CHROMIUM = Path("/usr/bin/chromium")
 pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"needs a browser at {CHROMIUM}")

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cqn_train.operator_page.board import Board
-from cqn_train.operator_page.session import Event, Session, State
+from cqn_train.operator.board import Board
+from cqn_train.operator.session import Event, Session, State
 from lerobot_cqn.errors import ConfigError
 
 pytest.importorskip("fastapi", reason="needs the extra [page]")
@@ -22,8 +22,8 @@ from fastapi.testclient import TestClient  # noqa: E402
 from starlette.websockets import WebSocketDisconnect  # noqa: E402
 from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 
-from cqn_train.operator_page.app import MAX_BODY, MAX_PAGES, need_extra  # noqa: E402
-from cqn_train.operator_page.server import OperatorServer, make_app  # noqa: E402
+from cqn_train.operator.page.app import MAX_BODY, MAX_PAGES, need_extra  # noqa: E402
+from cqn_train.operator.page.server import OperatorServer, make_app  # noqa: E402
 
 from .operator_clients import (  # noqa: E402, F401  # fixtures among them
     ANN,

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from cqn_train.operator_page.board import Board
-from cqn_train.operator_page.session import BY_ITSELF, TRANSITIONS, Event, State
+from cqn_train.operator.board import Board
+from cqn_train.operator.session import BY_ITSELF, TRANSITIONS, Event, State
 
 pytest.importorskip("fastapi", reason="needs the extra [page]")
 

@@ -71,7 +71,10 @@ def test_every_file_of_the_packages_is_packed(source):
     files = {path for name in FOLDERS for path in (source / name).rglob("*") if path.is_file()}
     packed = build.packed_files(source)
     assert not sorted(str(path) for path in files if path.relative_to(source).as_posix() not in packed)
-    assert {"datasets_tools/recipes/simulation.yaml", "train/operator_page/static/index.html"} <= packed.keys()
+    assert {
+        "datasets_tools/operations/recipes/simulation.yaml",
+        "train/operator/page/static/index.html",
+    } <= packed.keys()
 
 
 def test_wheel_and_sdist_hold_that_and_nothing_else(wheel, sdist, source):

@@ -13,9 +13,9 @@ import pytest
 import yaml
 from huggingface_hub import close_session
 
-from cqn_data import hub as hub_module
+from cqn_data.hub import client as hub_module
 from cqn_train.cli import main as cqn_train
-from cqn_train.push import main
+from cqn_train.push.cli import main
 
 from ..hub_server import HubServer
 from .conftest import STATION, TINY_POLICY, TINY_RUN

@@ -11,7 +11,7 @@ import pytest
 from lerobot.robots import make_robot_from_config
 from lerobot.teleoperators import make_teleoperator_from_config
 
-from cqn_train.envs.ur5e import HOME
+from cqn_train.envs.ur5e_station.ur5e import HOME
 from cqn_train.sim_arm import FAULTS, Fault, SimLeaderConfig, SimUR5eConfig
 from cqn_train.sim_arm.sim_ur5e import SimUR5e, from_robot_units, to_robot_units
 from cqn_train.sim_arm.world import WORLDS

@@ -14,7 +14,7 @@ from lerobot.envs.factory import make_env, make_env_config
 from lerobot.envs.utils import close_envs, env_to_policy_features, preprocess_observation
 
 from cqn_train.envs import UR5eStationEnv
-from cqn_train.envs.tasks import TASKS
+from cqn_train.envs.ur5e_station.tasks import TASKS
 from lerobot_cqn.errors import ConfigError
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from cqn_train.stages import Stages
+from cqn_train.demo.stages import Stages
 
 TINY = (
     "--demonstrations=3", "--offline_updates=4", "--steps=30", "--eval_freq=0", "--eval_episodes=1",
@@ -20,7 +20,7 @@ TINY = (
 @pytest.mark.timeout(300)
 def test_demo_runs_every_arrow_and_a_second_start_does_not_repeat_it(tmp_path: Path) -> None:
     out = tmp_path / "demo"
-    command = [sys.executable, "-m", "cqn_train.demo", f"--output_dir={out}", *TINY]
+    command = [sys.executable, "-m", "cqn_train.demo.station", f"--output_dir={out}", *TINY]
     first = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert first.returncode == 0, first.stdout + first.stderr
 
@@ -65,7 +65,7 @@ def test_demo_names_the_command_that_failed(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     out.mkdir()
     (out / "data").write_text("a file in the way of the recording")
-    command = [sys.executable, "-m", "cqn_train.demo", f"--output_dir={out}", *TINY]
+    command = [sys.executable, "-m", "cqn_train.demo.station", f"--output_dir={out}", *TINY]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 2
     assert result.stderr.startswith("demo: error: 'record' failed")

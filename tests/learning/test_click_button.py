@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cqn_train.evaluate import wilson_interval
+from cqn_train.loop.evaluate import wilson_interval
 
 SEEDS = (0, 1, 2)
 STATION = ("--env.type=ur5e_station", "--env.task=click_button")

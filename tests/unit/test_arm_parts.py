@@ -11,7 +11,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import make_pre_post_processors
 
 from cqn_train.agent import Agent
-from cqn_train.arm_parts import _check_home, check_robot_fits, home_of, limits_of
+from cqn_train.arm.build import _check_home, check_robot_fits, home_of, limits_of
 from cqn_train.config import DatasetSettings
 from cqn_train.robot.limits import Limits
 from cqn_train.robot.settings import ArmSettings

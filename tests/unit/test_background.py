@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from cqn_train.background import Background
+from cqn_train.loop.background import Background
 
 Stop = Callable[[], bool]
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import yaml
 
-from cqn_data.card import TOOL, Facts, Labels, look, write_card
-from cqn_data.job import Job, run_job
-from cqn_data.readme import Readme, end_mark, start_mark
-from cqn_data.run import load_recipe
-from cqn_data.source import open_source
+from cqn_data.disk.source import open_source
+from cqn_data.hub.card import TOOL, Facts, Labels, look, write_card
+from cqn_data.hub.readme import Readme, end_mark, start_mark
+from cqn_data.operations.job import Job, run_job
+from cqn_data.operations.recipe import load_recipe
 from lerobot_cqn.errors import DataError
 from lerobot_cqn.story import tell, told
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cqn_data.pauses import Rule, keep_mask, pause_runs, report_episode
+from cqn_data.decisions.pauses import Rule, keep_mask, pause_runs, report_episode
 from lerobot_cqn.errors import DataError
 
 THRESHOLD = 0.01

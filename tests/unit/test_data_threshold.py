@@ -9,8 +9,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from cqn_data.pauses import Rule, keep_mask
-from cqn_data.threshold import BINS, Motion, suggest
+from cqn_data.decisions.pause_threshold import BINS, Motion, suggest
+from cqn_data.decisions.pauses import Rule, keep_mask
 from lerobot_cqn.errors import DataError
 
 JOINTS = 6
@@ -135,7 +135,7 @@ def test_a_million_steps_are_cheap():
 def station_episodes(task, share, tremor, seed):
     """(state (T, 7), action (T, 7), pause (T,)) of each successful episode, as `cqn-data record` would keep them."""
     pytest.importorskip("mujoco")
-    from cqn_train.envs.station import UR5eStation
+    from cqn_train.envs.ur5e_station.station import UR5eStation
 
     env = UR5eStation(task=task)
     count = max(4, 240 // env.station_task.typical_steps)  # long episodes tell as much in smaller numbers
@@ -173,7 +173,7 @@ def judge(episodes):
 
 
 def station_tasks():
-    from cqn_train.envs.tasks import TASKS
+    from cqn_train.envs.ur5e_station.tasks import TASKS
 
     return sorted(TASKS)
 
@@ -192,7 +192,7 @@ def test_finds_the_pauses_of_the_station(task, share, tremor):
 def test_the_recorder_says_where_the_pauses_are(tmp_path):
     pytest.importorskip("mujoco")
     from cqn_data.cli import main
-    from cqn_data.source import open_source
+    from cqn_data.disk.source import open_source
 
     environment = dict(os.environ)
     try:

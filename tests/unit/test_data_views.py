@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cqn_data.bounds import quantile_bounds
-from cqn_data.deltas import KINDS, Deltas, absolute_action, delta_action, select, to_absolute, to_delta
-from cqn_data.filtered import Selected
-from cqn_data.label import Label
-from cqn_data.resample import Resample, Resampled, windows
-from cqn_data.rules import parse_rule
-from cqn_data.trim import Trim
-from cqn_data.view import Bounds, Episode, View
+from cqn_data.decisions.deltas import KINDS, Deltas, absolute_action, delta_action, select, to_absolute, to_delta
+from cqn_data.decisions.episode_rules import parse_rule
+from cqn_data.operations.bounds import quantile_bounds
+from cqn_data.operations.label import Label
+from cqn_data.operations.resample import Resample, Resampled, windows
+from cqn_data.operations.trim import Trim
+from cqn_data.views.selected import Selected
+from cqn_data.views.view import Bounds, Episode, View
 from lerobot_cqn.errors import ConfigError, DataError
 
 JOINTS = Deltas("command", (0, 1), (0, 1))

@@ -13,8 +13,8 @@ from lerobot.policies.factory import make_pre_post_processors
 from lerobot.policies.utils import prepare_observation_for_inference
 from torch import Tensor
 
-from cqn_data.pictures import shaped
-from cqn_data.view import Camera
+from cqn_data.disk.pictures import shaped
+from cqn_data.views.view import Camera
 from lerobot_cqn.configuration_cqn import CQNConfig
 from lerobot_cqn.configuration_drqv2 import DrQv2Config
 from lerobot_cqn.fit_pictures import FitPicturesProcessorStep, fitted

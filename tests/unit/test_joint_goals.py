@@ -16,7 +16,7 @@ from lerobot.policies.factory import make_pre_post_processors
 from lerobot.processor import NormalizerProcessorStep
 from lerobot.processor.relative_action_processor import RelativeActionsProcessorStep
 
-from cqn_data.deltas import KINDS, to_absolute, to_delta
+from cqn_data.decisions.deltas import KINDS, to_absolute, to_delta
 from lerobot_cqn.configuration_cqn import CQNConfig
 from lerobot_cqn.configuration_drqv2 import DrQv2Config
 from lerobot_cqn.errors import DataError

@@ -7,8 +7,8 @@ import pytest
 import torch
 from PIL import Image
 
-from cqn_train.look import draw_batch, save_batch, warnings_about
-from cqn_train.replay import Episode, Replay
+from cqn_train.replay.buffer import Episode, Replay
+from cqn_train.run.first_look import draw_batch, save_batch, warnings_about
 
 
 def demonstration(seed: int, *, still: float = 0.0, narrow: bool = False, success: bool = True) -> Episode:

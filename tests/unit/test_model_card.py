@@ -10,7 +10,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.robots.so_follower import SO101FollowerConfig
 from lerobot.teleoperators.so_leader import SO101LeaderConfig
 
-from cqn_train.envs.registration import UR5eStationEnv
+from cqn_train.envs.ur5e_station.config import UR5eStationEnv
 from lerobot_cqn.configuration_cqn import CQNConfig
 from lerobot_cqn.model_card import (
     Commands,

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cqn_train.operator_page.board import Board
-from cqn_train.operator_page.control import LEFT_S, Control, ViewingOnlyError
-from cqn_train.operator_page.session import Event, Label, RefusedError, Session, State
+from cqn_train.operator.board import Board
+from cqn_train.operator.control import LEFT_S, Control, ViewingOnlyError
+from cqn_train.operator.session import Event, Label, RefusedError, Session, State
 
 
 class Clock:

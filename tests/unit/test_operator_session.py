@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cqn_train import interfaces
-from cqn_train.operator_page.session import TRANSITIONS, Event, Label, RefusedError, Session, State
+from cqn_train.operator.session import TRANSITIONS, Event, Label, RefusedError, Session, State
 
 # What a person would expect, written down on its own: state -> event -> next state; the rest is refused.
 EXPECTED = {

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from cqn_train.operator_page.session import Event, Session, State
-from cqn_train.operator_page.terminal import TerminalKeys
+from cqn_train.operator.keys import TerminalKeys
+from cqn_train.operator.session import Event, Session, State
 
 
 @pytest.fixture
@@ -111,8 +111,8 @@ def test_a_terminal_that_goes_away_ends_nothing() -> None:
 PROGRAM = """
 import fcntl, termios, time
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-from cqn_train.operator_page.session import Session
-from cqn_train.operator_page.terminal import TerminalKeys
+from cqn_train.operator.session import Session
+from cqn_train.operator.keys import TerminalKeys
 try:
     with TerminalKeys(Session()):
         time.sleep(60)

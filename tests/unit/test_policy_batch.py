@@ -13,8 +13,8 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 
 from cqn_train.agent import Agent
 from cqn_train.config import DatasetSettings
-from cqn_train.demonstrations import load_episodes, load_metadata
-from cqn_train.replay import Replay
+from cqn_train.replay.buffer import Replay
+from cqn_train.replay.demonstrations import load_episodes, load_metadata
 from lerobot_cqn.configuration_cqn import CQNConfig
 from lerobot_cqn.errors import ConfigError, DataError
 from lerobot_cqn.modeling_cqn import CQNPolicy

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cqn_train.replay import Episode, Replay
+from cqn_train.replay.buffer import Episode, Replay
 from lerobot_cqn.errors import DataError
 from lerobot_cqn.schema import Batch
 

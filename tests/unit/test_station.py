@@ -11,9 +11,9 @@ pytest.importorskip("mujoco")
 
 import cqn_train.envs
 from cqn_train.envs.cameras import Cameras
-from cqn_train.envs.registration import gym_id
-from cqn_train.envs.station import CAMERAS, MAX_JOINT_SPEED
-from cqn_train.envs.tasks import TASKS
+from cqn_train.envs.ur5e_station.config import gym_id
+from cqn_train.envs.ur5e_station.station import CAMERAS, MAX_JOINT_SPEED
+from cqn_train.envs.ur5e_station.tasks import TASKS
 from lerobot_cqn.errors import ConfigError, DataError
 
 TASK_NAMES = sorted(TASKS)

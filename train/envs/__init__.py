@@ -5,8 +5,8 @@ from .dmc_config import DMCEnv
 from .hil_config import HilSimEnv
 from .metaworld_config import MetaworldSparseEnv
 from .pusht_config import PushtSmallEnv
-from .registration import UR5eStationEnv
 from .rlbench_config import RLBenchEnv
+from .ur5e_station.config import UR5eStationEnv
 
 __all__ = [
     "AlohaSmallEnv",

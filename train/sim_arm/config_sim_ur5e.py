@@ -6,8 +6,8 @@ from lerobot.robots.config import RobotConfig
 
 from lerobot_cqn.errors import ConfigError, one_of
 
-from ..envs.station import CAMERAS
-from ..envs.tasks import TASKS
+from ..envs.ur5e_station.station import CAMERAS
+from ..envs.ur5e_station.tasks import TASKS
 
 __all__ = ["FAULTS", "Fault", "SimUR5eConfig"]
 

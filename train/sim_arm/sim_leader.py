@@ -7,9 +7,9 @@ from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from numpy.typing import NDArray
 
-from ..envs.expert import ScriptedTeleoperator
-from ..envs.station import MAX_JOINT_SPEED
-from ..envs.ur5e import HOME, STATE_NAMES
+from ..envs.ur5e_station.expert import ScriptedTeleoperator
+from ..envs.ur5e_station.station import MAX_JOINT_SPEED
+from ..envs.ur5e_station.ur5e import HOME, STATE_NAMES
 from .config_sim_leader import SimLeaderConfig
 from .sim_ur5e import from_robot_units, to_robot_units
 from .world import World, find_world

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.errors import ConfigError
 
-from ..envs.tasks import TASKS
-from ..envs.ur5e import STATE_NAMES
+from ..envs.ur5e_station.tasks import TASKS
+from ..envs.ur5e_station.ur5e import STATE_NAMES
 from .config_sim_ur5e import SimUR5eConfig
 from .person import SimPerson
 from .world import WORLDS, World

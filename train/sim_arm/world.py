@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from lerobot_cqn.errors import ConfigError, one_of
 
 from ..envs.cameras import Cameras
-from ..envs.station import LEASH, MAX_JOINT_SPEED
-from ..envs.tasks import TASKS
-from ..envs.ur5e import HOME, TIMESTEP, Arm
+from ..envs.ur5e_station.station import LEASH, MAX_JOINT_SPEED
+from ..envs.ur5e_station.tasks import TASKS
+from ..envs.ur5e_station.ur5e import HOME, TIMESTEP, Arm
 
 __all__ = ["WORLDS", "World", "find_world"]
 

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 
-from cqn_train.bench_report import aggregate, check_packages
+from cqn_train.bench.report import aggregate, check_packages
 from lerobot_cqn.errors import CQNError
 
 try:

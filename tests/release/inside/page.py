@@ -4,9 +4,9 @@ import http.client
 import json
 import sys
 
-from cqn_train.operator_page.board import Board
-from cqn_train.operator_page.server import OperatorServer
-from cqn_train.operator_page.session import Session
+from cqn_train.operator.board import Board
+from cqn_train.operator.page.server import OperatorServer
+from cqn_train.operator.session import Session
 from lerobot_cqn.errors import CQNError
 
 try:

@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from cqn_train.metrics import start_tensorboard
+from cqn_train.run.metrics import start_tensorboard
 from lerobot_cqn.errors import CQNError
 
 folder = Path("events")

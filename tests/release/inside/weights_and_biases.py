@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from cqn_train.metrics import start_wandb
+from cqn_train.run.metrics import start_wandb
 from lerobot_cqn.errors import CQNError
 
 try:

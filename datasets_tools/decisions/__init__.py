@@ -1,0 +1,1 @@
+"""What to keep, drop and change, as pure functions on arrays."""

@@ -1,0 +1,1 @@
+"""LeRobotDatasets on disk: read, encode, rewrite, appear in one piece."""

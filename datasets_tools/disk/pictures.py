@@ -1,0 +1,79 @@
+"""Pictures from video files, one after the other, cut out and scaled on the way. Each file is decoded once."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_cqn.errors import DataError
+
+from ..views.view import Camera
+
+__all__ = ["shaped", "video_pictures"]
+
+type Picture = NDArray[np.uint8]
+
+
+def video_pictures(
+    path: Path, times: NDArray[np.float64], fps: int, episode: int, frames: NDArray[np.int64]
+) -> Iterator[Picture]:
+    """Yield the pictures nearest to ascending ``times`` from front to back, without going back in the file.
+
+    Args:
+        path: video file.
+        times: (K,) seconds in the file, not descending.
+        fps: frames a second; a picture half a period away or more is another one.
+        episode: for error messages.
+        frames: (K,) numbers of the frames in the episode, for error messages.
+
+    Yields:
+        (H, W, 3) uint8.
+
+    Raises:
+        DataError: the file cannot be opened, or a frame is damaged or not there.
+    """
+    position = 0
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            if stream.time_base is None:
+                raise ValueError("the video has no time base")
+            container.seek(max(0, int((times[0] - 0.5 / fps) / stream.time_base)), stream=stream)
+            for frame in container.decode(stream):
+                if frame.time is None or frame.time < times[position] - 0.5 / fps:
+                    continue
+                picture: Picture | None = None
+                while position < len(times) and abs(frame.time - times[position]) < 0.5 / fps:
+                    picture = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8) if picture is None else picture
+                    position += 1
+                    yield picture
+                if position == len(times):
+                    return
+                if frame.time > times[position] + 0.5 / fps:
+                    break
+        reason = f"no picture at {times[position]:.3f} s"
+    except (av.error.FFmpegError, OSError, ValueError, IndexError) as error:
+        reason = " ".join(str(error).split())[:160]
+    raise DataError(f"Video {path} cannot be read at episode {episode}, frame {int(frames[position])}: {reason}")
+
+
+def shaped(picture: Picture, camera: Camera) -> Picture:
+    """Cut out and scale; the area filter when shrinking, linear when growing.
+
+    Args:
+        picture: (H, W, 3).
+        camera: cut and size.
+    """
+    if camera.crop is not None:
+        top, left, height, width = camera.crop
+        picture = picture[top : top + height, left : left + width]
+    if camera.size is None or camera.size == picture.shape[:2]:
+        return np.ascontiguousarray(picture)
+    height, width = camera.size
+    shrinks = height <= picture.shape[0] and width <= picture.shape[1]
+    scaled = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    return np.asarray(scaled, dtype=np.uint8)

@@ -1,0 +1,155 @@
+"""Write a view whose pictures do not change: videos copied byte by byte, only numbers and their statistics anew."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import datasets
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from lerobot.datasets.compute_stats import aggregate_stats, compute_episode_stats
+from lerobot.datasets.feature_utils import get_hf_features_from_features
+from lerobot.datasets.io_utils import write_stats
+from rich.progress import Progress
+
+from lerobot_cqn.errors import DataError
+
+from ..views.view import SOURCE_EPISODE, SOURCE_FRAME, Bounds, View
+from .source import NOT_NUMBERS, Source
+from .target import new_folder, write_history
+
+__all__ = ["INDEX", "all_features", "rewrite", "traced_columns", "write_bounds"]
+
+INDEX: dict[str, Any] = {"dtype": "int64", "shape": (1,), "names": None}
+ANEW = ("data", "meta/info.json", "meta/stats.json", "meta/episodes", "meta/cqn_history.json")
+
+type Stats = dict[str, dict[str, Any]]
+
+
+def all_features(view: View) -> dict[str, dict[str, Any]]:
+    """Features of the view and the two columns that say where each step was recorded."""
+    return {SOURCE_EPISODE: dict(INDEX), SOURCE_FRAME: dict(INDEX)} | view.features
+
+
+def traced_columns(view: View, index: int) -> dict[str, Any]:
+    """An episode's columns with those of its recording; a dataset that has them keeps pointing further back."""
+    episode = view.episode(index)
+    frames = episode.frames[:, None]
+    return {SOURCE_EPISODE: np.full_like(frames, episode.index), SOURCE_FRAME: frames} | episode.columns
+
+
+def rewrite(view: View, repo_id: str, root: Path, bar: Progress) -> None:
+    """Write ``view`` to ``root``; every frame of the source must still be in it.
+
+    Raises:
+        DataError: a file of the source cannot be read.
+        OutputExistsError: something is at ``root``.
+    """
+    source = view.source
+    _refuse_cut_videos(source)
+    with new_folder(root) as folder:
+        _copy_rest(source.root, folder, bar)
+        stats = _write_numbers(view, folder, bar)
+        _write_episodes(source, folder, stats)
+        old = {k: v for k, v in (source.meta.stats or {}).items() if k in view.features or "." not in k}
+        write_stats({**old, **aggregate_stats(list(stats.values()))}, folder)
+        info = json.loads((source.root / "meta/info.json").read_text())
+        own = {k: v for k, v in info["features"].items() if k not in source.features}
+        info["features"] = {**_plain(all_features(view)), **own}
+        (folder / "meta/info.json").write_text(json.dumps(info, indent=4) + "\n")
+        view.settle(view.episodes)
+        write_bounds(folder, view.bounds)
+        write_history(folder, view.history())
+
+
+def write_bounds(folder: Path, bounds: Bounds | None) -> None:
+    """Put action bounds where training reads them: smallest and largest action in ``meta/stats.json``."""
+    if bounds is None:
+        return
+    path = folder / "meta/stats.json"
+    stats = json.loads(path.read_text())
+    stats["action"] |= {"min": bounds.low.tolist(), "max": bounds.high.tolist()}
+    path.write_text(json.dumps(stats, indent=4) + "\n")
+
+
+def _refuse_cut_videos(source: Source) -> None:
+    """Look at the last picture of every video file: what ends too early must not be copied as if it were whole."""
+    last = {(key, source.video_path(i, key)): i for key in source.meta.video_keys for i in source.episodes}
+    for (key, _), index in last.items():
+        if key not in source.cameras:  # depth
+            continue
+        episode = source.episode(index)
+        for _ in source.camera_frames(episode, np.array([len(episode) - 1]), {key: source.cameras[key]}):
+            pass
+
+
+def _copy_rest(source: Path, folder: Path, bar: Progress) -> None:
+    files = [p for p in sorted(source.rglob("*")) if p.is_file() and not p.name.startswith(".")]
+    files = [p for p in files if not any(p.relative_to(source).is_relative_to(name) for name in ANEW)]
+    for path in bar.track(files, description="Copying files"):
+        copy = folder / path.relative_to(source)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, copy)
+
+
+def _write_numbers(view: View, folder: Path, bar: Progress) -> dict[int, Stats]:
+    """The data files, in the source's own partition; returns each episode's statistics of the numbers."""
+    source = view.source
+    features = {**view.source.meta.features, **all_features(view)}
+    schema = get_hf_features_from_features(features)
+    numbers = {k: f for k, f in all_features(view).items() if f["dtype"] not in NOT_NUMBERS}
+    stats: dict[int, Stats] = {}
+    line = bar.add_task("Writing episodes", total=len(view.episodes))
+    for path, episodes in _partition(source):
+        columns: dict[str, list[Any]] = {k: [] for k in numbers}
+        for index in episodes:
+            own = traced_columns(view, index)
+            flat = {k: v.reshape(len(v)) if f["shape"] == (1,) and f["dtype"] != "string" else v
+                    for (k, f), v in ((item, own[item[0]]) for item in numbers.items())}  # fmt: skip
+            stats[index] = compute_episode_stats(flat, numbers)
+            for key, values in flat.items():
+                columns[key].extend(values)
+            bar.advance(line)
+        fresh = datasets.Dataset.from_dict(columns, features=datasets.Features({k: schema[k] for k in numbers}))
+        table = fresh.with_format("arrow")[:]
+        old = pq.read_table(source.root / path)
+        if len(old) != len(table):
+            raise DataError(f"{source.root / path} holds {len(old)} frames, its episodes {len(table)}; it is damaged.")
+        arrays = [table[k] if k in numbers else old[k] for k in schema]
+        target = folder / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.table(arrays, schema=schema.arrow_schema), target, compression="snappy")
+    return stats
+
+
+def _partition(source: Source) -> Iterator[tuple[Path, list[int]]]:
+    """Data files with their episodes, in order."""
+    files: dict[Path, list[int]] = {}
+    for index in source.episodes:
+        files.setdefault(Path(source.meta.get_data_file_path(index)), []).append(index)
+    yield from files.items()
+
+
+def _write_episodes(source: Source, folder: Path, stats: dict[int, Stats]) -> None:
+    """The episodes' metadata with the new statistics; all other columns stay."""
+    for path in sorted((source.root / "meta/episodes").rglob("*.parquet")):
+        table = pq.read_table(path)
+        rows = [stats[i] for i in table["episode_index"].to_pylist()]
+        for key in rows[0]:
+            for name in rows[0][key]:
+                values = pa.array([np.asarray(row[key][name]).tolist() for row in rows])
+                column = f"stats/{key}/{name}"
+                if column in table.column_names:
+                    table = table.set_column(table.column_names.index(column), column, values)
+                else:
+                    table = table.append_column(column, values)
+        target = folder / path.relative_to(source.root)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(table, target)
+
+
+def _plain(features: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    return {k: {**f, "shape": list(f["shape"])} for k, f in features.items()}

@@ -1,0 +1,218 @@
+"""Write a new LeRobotDataset v3 in one piece: it is complete under its name, or there is nothing."""
+
+import contextlib
+import ctypes
+import errno
+import json
+import os
+import queue
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs import RGBEncoderConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.video_utils import StreamingVideoEncoder
+
+from lerobot_cqn.errors import ConfigError, OutputError, OutputExistsError
+from lerobot_cqn.schema import HISTORY, read_history
+
+from ..terminal.console import note
+
+__all__ = [
+    "HISTORY",
+    "Target",
+    "append_history",
+    "new_dataset",
+    "new_folder",
+    "read_history",
+    "refuse_existing",
+    "refuse_inside",
+    "write_history",
+]
+
+ENCODER_THREADS = 2  # for each camera; the encoder's memory grows with them, up to gigabytes on many cores
+CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
+
+
+def refuse_existing(root: Path) -> None:
+    """Raise OutputExistsError when there is anything at ``root``."""
+    if root.exists() or root.is_symlink():
+        raise OutputExistsError(f"{root} exists already and is left as it is; choose another folder.")
+
+
+def refuse_inside(source: Path, root: Path) -> None:
+    """Raise ConfigError when ``root`` lies in the dataset folder ``source``, which must stay as it is."""
+    if source.resolve() in root.resolve().parents:
+        raise ConfigError(f"{root} lies inside the source {source}; choose a folder outside.")
+
+
+class Target:
+    """A dataset that is being written in a temporary folder beside its final place."""
+
+    def __init__(self, dataset: LeRobotDataset, folder: Path) -> None:
+        self.dataset = dataset
+        self.folder = folder
+
+    def add(self, frame: dict[str, Any], task: str) -> None:
+        """Append one step; shapes and dtypes are those of the features."""
+        self.dataset.add_frame({**frame, "task": task})
+
+    def save_episode(self) -> None:
+        """Close the episode: statistics, video, parquet."""
+        # One encoder after the other: a process for each camera would outlive an interrupt.
+        try:
+            self.dataset.save_episode(parallel_encoding=False)
+        except RuntimeError as error:  # how LeRobot passes on what happened in an encoder's thread
+            raise OutputError(f"{self.folder} could not be written: {error}") from error
+        _give_back_memory()
+
+    def drop_episode(self) -> None:
+        """Forget the steps added since the last saved episode."""
+        self.dataset.clear_episode_buffer()
+
+    @property
+    def episodes(self) -> int:
+        """Episodes saved so far."""
+        return int(self.dataset.meta.total_episodes)
+
+    @property
+    def frames(self) -> int:
+        """Steps in the saved episodes."""
+        return int(self.dataset.meta.total_frames)
+
+
+class _PatientEncoder(StreamingVideoEncoder):
+    """Encodes while frames come in, and waits for the encoder where LeRobot's own would drop a frame."""
+
+    def feed_frame(self, video_key: str, image: Any) -> None:
+        thread, frames = self._threads[video_key], self._frame_queues[video_key]
+        while thread.is_alive():
+            try:
+                frames.put(image, timeout=1)
+            except queue.Full:
+                continue
+            return
+        raise RuntimeError(f"The encoder of '{video_key}' stopped; is the disk full?")
+
+
+class _Dataset(LeRobotDataset):
+    """LeRobot's dataset with an encoder that loses nothing."""
+
+    @staticmethod
+    def _build_streaming_encoder(
+        fps: int, rgb_encoder: Any, depth_encoder: Any, encoder_queue_maxsize: int, encoder_threads: int | None
+    ) -> StreamingVideoEncoder:
+        return _PatientEncoder(fps, rgb_encoder, depth_encoder, encoder_queue_maxsize, encoder_threads)
+
+
+@contextlib.contextmanager
+def new_folder(root: Path) -> Iterator[Path]:
+    """A temporary folder beside ``root`` that takes this name when the block ends well.
+
+    Any exception, Ctrl-C included, removes it; what a killed process left is removed by the next one for the same
+    place. Nothing is created before the block makes the folder.
+
+    Raises:
+        OutputExistsError: something is at ``root`` already, at the start or by the end.
+    """
+    refuse_existing(root)
+    folder = root.parent / f".{root.name}.{os.getpid()}.tmp"
+    try:
+        root.parent.mkdir(parents=True, exist_ok=True)
+        _sweep(root)
+        folder.mkdir()  # whether one may write there at all; whoever fills it expects to make it
+        folder.rmdir()
+    except OSError as error:
+        raise OutputError(f"Nothing can be written to {root.parent}: {error}") from error
+    try:
+        yield folder
+        refuse_existing(root)
+        os.replace(folder, root)
+    except OSError as error:
+        if error.errno not in CANNOT_WRITE:
+            raise
+        raise OutputError(f"{root} could not be written and nothing is left of it: {error}") from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def new_dataset(
+    repo_id: str,
+    root: Path,
+    *,
+    fps: int,
+    features: Mapping[str, Mapping[str, Any]],
+    robot_type: str | None = None,
+    encoder: RGBEncoderConfig | None = None,
+) -> Iterator[Target]:
+    """Create a dataset for the time of a ``with`` block and put it in place when the block ends well.
+
+    Raises:
+        OutputExistsError: something is at ``root`` already, at the start or by the end.
+    """
+    cameras = sum(f["dtype"] in ("image", "video") for f in features.values())
+    with new_folder(root) as folder:
+        dataset: LeRobotDataset | None = None
+        try:
+            dataset = _Dataset.create(
+                repo_id,
+                fps=fps,
+                features={k: dict(v) for k, v in features.items()},
+                root=folder,
+                robot_type=robot_type,
+                use_videos=any(f["dtype"] == "video" for f in features.values()),
+                image_writer_threads=2 if cameras else 0,
+                rgb_encoder=encoder,
+                streaming_encoding=True,
+                encoder_threads=ENCODER_THREADS,
+            )
+            yield Target(dataset, folder)
+            dataset.finalize()
+            shutil.rmtree(folder / "images", ignore_errors=True)
+        finally:
+            if dataset is not None:
+                # Finalised before the folder goes: the writer would otherwise recreate it when it is collected.
+                with contextlib.suppress(Exception):
+                    dataset.writer.cancel_pending_videos()
+                with contextlib.suppress(Exception):
+                    dataset.finalize()
+
+
+def write_history(folder: Path, operations: Sequence[Mapping[str, Any]]) -> None:
+    """Write ``meta/cqn_history.json``."""
+    path = folder / HISTORY
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"version": 1, "operations": list(operations)}, indent=2) + "\n")
+
+
+def append_history(folder: Path, previous: Path | None, entry: Mapping[str, Any]) -> None:
+    """Write the operations on ``previous`` (a dataset folder) and then ``entry``."""
+    write_history(folder, [*(read_history(previous) if previous else []), dict(entry)])
+
+
+def _give_back_memory() -> None:
+    """Return freed memory to the system: each episode's encoder threads leave pools of it, which glibc keeps."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def _sweep(root: Path) -> None:
+    """Remove the temporary folders of processes that are no more."""
+    for left in root.parent.glob(f".{root.name}.*.tmp"):
+        number = left.name.removeprefix(f".{root.name}.").removesuffix(".tmp")
+        if number.isdigit() and not _alive(int(number)):
+            note(f"Removing {left}, which a killed process left behind.")
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _alive(number: int) -> bool:
+    try:
+        os.kill(number, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True

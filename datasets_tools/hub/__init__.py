@@ -1,0 +1,1 @@
+"""Datasets and policies to the Hugging Face Hub."""

@@ -1,0 +1,313 @@
+"""``cqn-data inspect``: a look at a dataset before anything is trained on it. Nothing in it is changed.
+
+``inspection`` has what it measures (numbers, follow, cameras), judges (checks) and draws (page, svg).
+"""
+
+import dataclasses
+import itertools
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..terminal.console import load_lerobot, note, progress, result, table
+from ..terminal.options import help_page, option, parse
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ..disk.source import Source
+    from .cameras import CameraLook
+    from .checks import Dataset, Finding
+    from .numbers import Numbers
+
+__all__ = ["InspectConfig", "Inspection", "help", "inspect_dataset", "main"]
+
+PAGE = "inspect.html"
+MAX_ROWS = 40
+EXAMPLE = """
+cqn-data inspect --repo_id=local/click --root=data/click
+cqn-data inspect --repo_id=local/click --root=data/click --json --strict > inspect.json
+"""
+NOTES = """
+Findings are errors (training fails, or learns nothing from this), warnings (it suffers) and notes. Numbers are read of
+every step, pictures of 30 steps a camera.
+Exit code: 0, or 1 with --strict where there is an error, or 2 where there is no dataset to look at.
+"""
+
+
+@dataclasses.dataclass
+class InspectConfig:
+    """Settings of ``cqn-data inspect``."""
+
+    repo_id: str = option(help="Dataset to look at, as user/name.")
+    root: str | None = option(None, help="Its folder; by default LeRobot's home and the repo_id.")
+    html: str | None = option(
+        None, help=f"Write the page to this file, which must not exist; by default {PAGE}, with --json none."
+    )
+    json: bool = option(False, help="Print one JSON object to stdout, and nothing else.")
+    strict: bool = option(False, help="Exit with code 1 where there is an error.")
+
+    @property
+    def page(self) -> Path | None:
+        """Where the page goes."""
+        if self.html:
+            return Path(self.html).expanduser()
+        numbered = (Path(PAGE if n == 1 else f"{Path(PAGE).stem}_{n}.html") for n in itertools.count(1))
+        return None if self.json else next(path for path in numbered if not path.exists())
+
+
+@dataclasses.dataclass
+class Inspection:
+    """All that was measured and found. ``numbers`` and ``dataset`` are None where it could not be opened."""
+
+    findings: "list[Finding]"
+    dataset: "Dataset | None" = None
+    numbers: "Numbers | None" = None
+    cameras: "Sequence[CameraLook]" = ()
+
+    @property
+    def ok(self) -> bool:
+        """Without an error."""
+        return not any(f.level == "error" for f in self.findings)
+
+
+def help() -> str:
+    """Help page."""
+    return help_page("inspect", "look at a dataset before training", InspectConfig, EXAMPLE, NOTES)
+
+
+def main(args: list[str]) -> int:
+    """Run from the command line and return the exit code.
+
+    Raises:
+        ConfigError: an unknown option.
+        DataError: the dataset cannot be opened; with ``--strict`` the exit code is 1 instead.
+        OutputExistsError: the page's file exists already.
+    """
+    from lerobot_cqn.errors import DataError
+
+    config = parse(InspectConfig, args)
+    load_lerobot()
+    from ..disk.source import open_source
+    from ..disk.target import refuse_existing
+    from .checks import Finding
+
+    page = config.page  # once: after it is written, the next free name is another one
+    if page is not None:
+        refuse_existing(page)
+    try:
+        source = open_source(config.repo_id, config.root)
+    except DataError as error:
+        found = Inspection([Finding("error", "unreadable", "dataset", str(error))])
+        if config.json:
+            _print_json(config, found)
+        if not config.strict:
+            raise
+        note(str(error))
+        return 1
+    inspection = inspect_dataset(config.repo_id, source)
+    if page is not None:
+        _write_page(page, inspection)
+    if config.json:
+        _print_json(config, inspection)
+    else:
+        _show(inspection)
+    if page is not None:
+        (note if config.json else result)(f"Report: {page}")
+    return int(config.strict and not inspection.ok)
+
+
+def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
+    """Measure and judge; what is damaged becomes a finding, and the rest is looked at all the same."""
+    import numpy as np
+
+    from .cameras import look, missing_videos
+    from .checks import Dataset, findings
+    from .numbers import STATE, measure
+
+    missing = missing_videos(source)
+    with progress() as bar:
+        line = bar.add_task("Reading numbers", total=2 * len(source.episodes))
+        numbers = measure(source, lambda: bar.advance(line))
+        spans = np.array([max(d.high - d.low, 0.0) for d in numbers.of(STATE)])
+
+        def moves(index: int, first: int, last: int) -> bool:
+            """Whether a joint goes through a tenth of its range."""
+            if STATE not in source.features:
+                return False
+            state = np.asarray(source.episode(index).columns[STATE], np.float64).reshape(-1, len(spans))
+            return bool((np.ptp(state[first : last + 1], axis=0) > 0.1 * spans).any())
+
+        line = bar.add_task("Looking at pictures", total=len(source.cameras))
+        cameras = look(source, numbers.episodes, moves, lambda: bar.advance(line))
+    try:
+        deltas = source.deltas is not None
+    except Exception:  # a damaged history is not what is inspected here
+        deltas = False
+    dataset = Dataset(repo_id, source.fps, list(source.features), len(source.episodes), deltas)
+    return Inspection(findings(dataset, numbers, cameras, missing), dataset, numbers, cameras)
+
+
+def _write_page(path: Path, inspection: Inspection) -> None:
+    from lerobot_cqn.errors import OutputExistsError
+
+    from .page import page
+
+    if inspection.dataset is None or inspection.numbers is None:
+        return
+    text = page(inspection.dataset, inspection.numbers, inspection.cameras, inspection.findings)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError as error:
+        raise OutputExistsError(f"{path} exists already and is left as it is; choose another file.") from error
+
+
+def _show(inspection: Inspection) -> None:
+    from .checks import PAPER_SIZE, memory
+    from .page import overview, sentence_of_actions, size_text, verdict
+
+    dataset, numbers = inspection.dataset, inspection.numbers
+    if dataset is None or numbers is None:
+        return
+    result(f"{dataset.repo_id}: {overview(dataset, numbers, inspection.cameras)}")
+    if numbers.episodes:
+        _show_episodes(dataset, numbers)
+    found = numbers.threshold
+    if found is not None and found.steps:
+        result(f"Threshold {found.threshold:g}: {found.reason}")
+        result("Still steps at " + ", ".join(f"{a.threshold:g}: {a.share:.0%}" for a in found.alternatives))
+    for line in filter(None, [sentence_of_actions(numbers)]):
+        result(line)
+    needed = memory(numbers, inspection.cameras)
+    pictures = (
+        f", pictures {size_text(needed.pictures)}, or {size_text(needed.pictures_84)} at {PAPER_SIZE} x {PAPER_SIZE}"
+    )
+    result(f"Replay: numbers {size_text(needed.vectors)}{pictures if inspection.cameras else ''}")
+    for finding in inspection.findings:
+        result(f"{finding.level:<8} {finding.where}: {finding.text}")
+        if finding.advice:
+            result(f"         {finding.advice}")
+    result(verdict(inspection.findings))
+
+
+def _show_episodes(dataset: "Dataset", numbers: "Numbers") -> None:
+    def outcome(success: bool | None) -> str:
+        return "" if success is None else "success" if success else "failure"
+
+    rows = [
+        [
+            str(e.index),
+            str(e.steps),
+            f"{e.steps / dataset.fps:.1f} s",
+            f"{e.still:.0%}",
+            f"{e.still_start / dataset.fps:.1f} s",
+            f"{e.still_end / dataset.fps:.1f} s",
+            "" if e.gripper_events is None else str(e.gripper_events),
+            outcome(e.success),
+        ]
+        for e in numbers.episodes[:MAX_ROWS]
+    ]
+    still = sum(e.still * e.steps for e in numbers.episodes) / numbers.steps
+    total = ["total", str(numbers.steps), f"{numbers.steps / dataset.fps:.0f} s", f"{still:.0%}", "", "", "", ""]
+    table(["episode", "steps", "length", "still", "at start", "at end", "gripper", "outcome"], rows, total)
+    if len(numbers.episodes) > MAX_ROWS:
+        note(f"{len(numbers.episodes) - MAX_ROWS} more episodes are in --json.")
+
+
+def _print_json(config: InspectConfig, inspection: Inspection) -> None:
+    text = json.dumps(as_json(config.repo_id, inspection), indent=2, allow_nan=False)
+    sys.stdout.write(text + "\n")  # rich would take parts of it for markup or emoji
+
+
+def as_json(repo_id: str, inspection: Inspection) -> dict[str, Any]:
+    """Plain types; the shape is the same whatever was found, with None for what could not be measured."""
+    from .checks import LEVELS, memory
+
+    dataset, numbers, cameras = inspection.dataset, inspection.numbers, inspection.cameras
+    report: dict[str, Any] = {
+        "version": 1,
+        "repo_id": repo_id,
+        "ok": inspection.ok,
+        "counts": {level: sum(f.level == level for f in inspection.findings) for level in LEVELS},
+        "findings": [dataclasses.asdict(f) for f in inspection.findings],
+        "dataset": None,
+    }
+    if dataset is None or numbers is None:
+        return report
+    found, follow = numbers.threshold, numbers.follow
+    lag = follow.lag() if follow is not None and numbers.episodes else None
+    return report | {
+        "dataset": {"fps": dataset.fps, "episodes": dataset.episodes, "steps": numbers.steps, "tasks": numbers.tasks},
+        "threshold": None
+        if found is None
+        else {
+            "threshold": found.threshold,
+            "reason": found.reason,
+            "clear": found.clear,
+            "share": _round(found.share),
+            "unmoved": _round(found.unmoved),
+            "alternatives": [{"threshold": a.threshold, "share": _round(a.share)} for a in found.alternatives],
+            "log10_edges": [_round(e) for e in found.edges],
+            "counts": found.counts.tolist(),
+        },
+        "actions": None
+        if follow is None or not numbers.episodes
+        else {
+            "kind": follow.kind(),
+            "lag_steps": lag[0] if lag else None,
+            "lag_correlation": _round(lag[1]) if lag else None,
+            "mean_gap": [_round(g) for g in follow.gap()],
+        },
+        "episodes": [
+            {
+                "episode": e.index,
+                "steps": e.steps,
+                "still": _round(e.still),
+                "still_start": e.still_start,
+                "still_end": e.still_end,
+                "gripper_events": e.gripper_events,
+                "jitter": _round(e.jitter),
+                "first_reward": e.first_reward,
+                "success": e.success,
+            }
+            for e in numbers.episodes
+        ],
+        "bad_episodes": [{"episode": i, "reason": reason} for i, reason in numbers.bad.items()],
+        "dimensions": [
+            {
+                "column": d.column,
+                "name": d.name,
+                "gripper": d.gripper,
+                "constant": d.constant,
+                "low": _round(d.low),
+                "percentile_1": _round(d.inner_low),
+                "percentile_99": _round(d.inner_high),
+                "high": _round(d.high),
+            }
+            for d in numbers.dimensions
+            if numbers.episodes
+        ],
+        "jumps": [{k: _round(v) for k, v in dataclasses.asdict(j).items()} for j in numbers.jumps],
+        "jump_count": numbers.jump_count,
+        "cameras": [
+            {
+                "key": c.key,
+                "height": c.height,
+                "width": c.width,
+                "looked": c.looked,
+                "black": c.dark,
+                "blank": c.flat,
+                "frozen": c.frozen,
+                "broken": c.broken,
+            }
+            for c in cameras
+        ],
+        "memory_bytes": dataclasses.asdict(memory(numbers, cameras)),
+    }
+
+
+def _round(value: Any) -> Any:
+    return float(f"{float(value):.6g}") if isinstance(value, float) else value

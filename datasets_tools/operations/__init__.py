@@ -1,0 +1,1 @@
+"""One file an operation, the job that runs them, recipes."""

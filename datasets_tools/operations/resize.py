@@ -1,0 +1,129 @@
+"""``cqn-data resize``: smaller pictures, e.g. 480x640 -> 84x84, cut out first where asked."""
+
+import dataclasses
+from typing import Any
+
+from ..terminal.console import note, table
+from ..views.view import Camera, View
+from .job import Step, help_for, main_for, settings_of
+
+__all__ = ["Resize", "help", "main"]
+
+
+@dataclasses.dataclass
+class Resize(Step):
+    """Settings of ``cqn-data resize``."""
+
+    name = "resize"
+    summary = "scale the pictures, and cut them out first where asked"
+    example = """
+cqn-data resize --repo_id=local/pick --root=data/pick --new_root=data/pick_84 --size='[84, 84]'
+cqn-data resize --repo_id=local/pick --root=data/pick --new_root=data/pick_84 --size='[84, 84]' \\
+    --crop='{"top": [0, 80, 480, 480]}'
+"""
+    notes = """
+Crops are [top, left, height, width] in pixels of the present pictures. Shrinking uses the area filter, which does not
+alias. A camera may be named in full (observation.images.top) or by its last part (top).
+"""
+
+    size: list[int] = dataclasses.field(
+        default_factory=lambda: [84, 84], metadata={"help": "Height and width in pixels; 84x84 in the paper."}
+    )
+    crop: dict[str, list[int]] = dataclasses.field(
+        default_factory=dict, metadata={"help": """Part of a camera's picture, e.g. '{"top": [0, 80, 480, 480]}'."""}
+    )
+    cameras: list[str] = dataclasses.field(
+        default_factory=list, metadata={"help": "Only these cameras; by default all."}
+    )
+
+    def validate(self) -> None:
+        """Check sizes; raises ConfigError naming the option, what was expected and what was found."""
+        from lerobot_cqn.errors import ConfigError
+
+        if len(self.size) != 2 or not all(32 <= n <= 4096 for n in self.size):
+            raise ConfigError(f"Expected --size='[HEIGHT, WIDTH]' with 32 to 4096 pixels each, got {self.size}.")
+        if any(n % 2 for n in self.size):
+            raise ConfigError(f"Expected even numbers in --size, as video codecs do, got {self.size}.")
+        for name, box in self.crop.items():
+            if len(box) != 4 or min(box[:2]) < 0 or min(box[2:]) < 2:
+                raise ConfigError(f"Expected --crop='{{\"{name}\": [top, left, height, width]}}', got {box}.")
+
+    def on(self, view: View) -> View:
+        """Check crops against the pictures; raises ConfigError for an unknown camera or a box outside."""
+        from lerobot_cqn.errors import ConfigError
+
+        if not view.cameras:
+            raise ConfigError(
+                "The dataset has no camera: there is nothing to resize; without cameras use the recipe arm_state."
+            )
+        crops = {_camera(view, name): tuple(box) for name, box in self.crop.items()}
+        chosen = [_camera(view, name) for name in self.cameras] or list(view.cameras)
+        shapes, rows = dict(view.cameras), []
+        for key in dict.fromkeys([*chosen, *crops]):
+            before = view.cameras[key]
+            if before != Camera():
+                raise ConfigError(f"'{key}' is resized twice in one run; give --crop and --size together.")
+            height, width = picture_size(view.features[key])
+            box = crops.get(key)
+            if box and (box[0] + box[2] > height or box[1] + box[3] > width):
+                raise ConfigError(f"The crop {list(box)} of '{key}' lies outside its {height}x{width} picture.")
+            size = (self.size[0], self.size[1]) if key in chosen else (box[2], box[3]) if box else None
+            shapes[key] = Camera(crop=box, size=size)  # type: ignore[arg-type]  # four numbers, checked above
+            part = box[2:] if box else (height, width)
+            if size and (size[0] > part[0] or size[1] > part[1]):
+                note(f"'{key}' grows from {part[0]}x{part[1]} to {size[0]}x{size[1]}.")
+            if size and abs(size[0] * part[1] / (size[1] * part[0]) - 1) > 0.05:
+                note(f"'{key}' is squeezed from {part[0]}x{part[1]} to {size[0]}x{size[1]}; --crop keeps proportions.")
+            rows.append(
+                [key, f"{height}x{width}", str(list(box)) if box else "-", f"{size[0]}x{size[1]}" if size else "-"]
+            )
+        table(["camera", "before", "crop", "after"], rows)
+        after = Resized(view, shapes=shapes)
+        after.entry.update(settings=settings_of(self))
+        return after
+
+
+@dataclasses.dataclass
+class Resized(View):
+    """With other picture sizes."""
+
+    shapes: dict[str, Camera] = dataclasses.field(default_factory=dict)
+
+    @property
+    def cameras(self) -> dict[str, Camera]:
+        """What becomes of each camera's pictures."""
+        return self.shapes
+
+    @property
+    def features(self) -> dict[str, dict[str, Any]]:
+        """With the new shapes, (H, W, 3)."""
+        names = ["height", "width", "channels"]
+        new = {k: {"shape": (*c.size, 3), "names": names} for k, c in self.shapes.items() if c.size}
+        return {k: {**f, **new.get(k, {})} for k, f in self.parent.features.items()}
+
+
+def picture_size(feature: dict[str, Any]) -> tuple[int, int]:
+    """Height and width of a camera's pictures, whichever axis its channels are."""
+    shape, names = feature["shape"], feature.get("names")
+    channels_first = names[0] in ("channels", "channel") if isinstance(names, list) else shape[0] in (1, 3)
+    height, width = shape[1:] if channels_first else shape[:2]
+    return int(height), int(width)
+
+
+def _camera(view: View, name: str) -> str:
+    from lerobot_cqn.errors import ConfigError, one_of
+
+    found = [k for k in view.cameras if name in (k, k.rsplit(".", 1)[-1])]
+    if len(found) != 1:
+        raise ConfigError(one_of("camera", name, view.cameras))
+    return found[0]
+
+
+def help() -> str:
+    """Help page."""
+    return help_for(Resize)
+
+
+def main(args: list[str]) -> None:
+    """Run from the command line; errors as in ``run_job``."""
+    main_for(Resize, args)

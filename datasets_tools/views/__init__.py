@@ -1,0 +1,1 @@
+"""A dataset as operations leave it: views on views, nothing written or copied."""

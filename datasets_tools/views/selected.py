@@ -1,0 +1,90 @@
+"""A view without the pauses of its episodes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_cqn.errors import DataError
+
+from ..decisions.deltas import ACTION, STATE, absolute_action, select
+from ..decisions.pauses import EpisodeReport, Rule, keep_mask, report_episode
+from ..decisions.rewards import carries_reward
+from .readable import match_joints
+from .view import Bounds, Episode, View
+
+__all__ = ["Selected", "filtered_view"]
+
+
+@dataclass
+class Selected(View):
+    """Some rows of some episodes.
+
+    Attributes:
+        rows: episode -> (K,) ascending rows of the view before.
+    """
+
+    rows: dict[int, NDArray[np.int64]] = field(default_factory=dict)
+
+    @property
+    def episodes(self) -> Sequence[int]:
+        """Those with rows."""
+        return list(self.rows)
+
+    @property
+    def bounds(self) -> Bounds | None:
+        """Those of the view before were for other steps."""
+        return None
+
+    def episode(self, index: int) -> Episode:
+        """The chosen rows, delta actions formed anew."""
+        return select(self.parent.episode(index), self.rows[index], self.parent.deltas)
+
+
+def filtered_view(view: View, rule: Rule, min_steps: int, *, skip: bool) -> tuple[Selected, list[EpisodeReport]]:
+    """Apply ``rule`` to all episodes.
+
+    Args:
+        view: the view before.
+        rule: what a pause is.
+        min_steps: an episode that keeps fewer steps, and had as many, is refused.
+        skip: leave such episodes out instead.
+
+    Raises:
+        DataError: naming the episodes of which too little would be left.
+    """
+    after, reports, short = Selected(view), [], []
+    for index in view.episodes:
+        episode = view.episode(index)
+        state, action = episode.columns[STATE], episode.columns[ACTION]
+        mask = keep_mask(state, action, rule, carries_reward(episode.columns, len(episode)))
+        report = report_episode(index, state, action, mask, rule, commanded_joints(view, episode))
+        reports.append(report)
+        if report.kept < min(min_steps, report.steps):
+            short.append(report)
+        else:
+            after.rows[index] = np.flatnonzero(mask)
+    if short and (not skip or not after.rows):
+        named = ", ".join(f"{r.episode} ({r.kept} of {r.steps})" for r in short[:5])
+        more = f" and {len(short) - 5} more" if len(short) > 5 else ""
+        raise DataError(
+            f"Too little would be left of episode {named}{more}; expected at least --min_steps={min_steps}."
+            " Lower --threshold, raise --min_pause, or leave these episodes out with --skip_short."
+        )
+    if short:
+        after.entry["left_out"] = {r.episode: f"{r.kept} of {r.steps} steps would be left" for r in short}
+    return after, reports
+
+
+def commanded_joints(view: View, episode: Episode) -> NDArray[Any] | None:
+    """(T, J) commanded joint positions, where the actions are joints; None where they cannot be matched."""
+    if view.deltas is not None:
+        return absolute_action(episode, view.deltas)[:, list(view.deltas.action_dims)]
+    try:
+        actions, _ = match_joints(view)
+    except DataError:
+        return None
+    commanded: NDArray[Any] = episode.columns[ACTION][:, list(actions)]
+    return commanded

@@ -1,0 +1,1 @@
+"""An arm with a person beside it as an environment of the loop."""

@@ -1,0 +1,130 @@
+"""Who looks after the arm while no episode drives it: a thread that holds, shows, brings home, recovers."""
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..operator.session import IN_MOTION, Event, RefusedError, Session, State
+from ..robot.arm import Arm
+from ..robot.guard import HeldError, RobotFault, StoppedError
+
+__all__ = ["Attendant"]
+
+BETWEEN = (State.WAITING, State.RESETTING)
+LOOK_HZ = 10.0
+RETRY_S = 0.5
+
+
+class Attendant:
+    """Follows the session in a thread of its own; every change reaches it at once.
+
+    Attributes:
+        changed: notified whenever the session has changed, for whoever waits for it.
+    """
+
+    def __init__(self, arm: Arm, session: Session, show: Callable[[Mapping[str, NDArray[np.uint8]]], Any]) -> None:
+        self.arm, self.session, self._show = arm, session, show
+        self.changed = threading.Condition()
+        self._wake = threading.Event()
+        self._closing = threading.Event()
+        self._homeward = False
+        self._thread = threading.Thread(target=self._run, name="attendant", daemon=True)
+        self._tell = session.on_change
+        session.on_change = self._on_change
+
+    def start(self) -> None:
+        """Begin; the arm must be connected."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End, and leave the arm as it is."""
+        self._closing.set()
+        self._wake.set()
+        if self._thread.is_alive():
+            self._thread.join(5.0)
+        self.session.on_change = self._tell
+
+    def go_home(self) -> None:
+        """Bring the arm home as soon as it may move between episodes."""
+        self._homeward = True
+        self._wake.set()
+
+    def fault(self, error: RobotFault) -> None:
+        """Let the session know; from then on this thread tries to take the arm up again."""
+        with contextlib.suppress(RefusedError):  # stopped already
+            self.session.apply(Event.FAULT, str(error))
+
+    def _on_change(self, session: Session) -> None:
+        if session.state is State.STOPPED:
+            self.arm.guard.refuse()  # at once, whatever the attendant is at
+        if session.state in (*IN_MOTION, State.FAULTED):
+            self._homeward = False  # after a fault the arm does not set off by itself while it is looked after
+        self._wake.set()
+        with self.changed:
+            self.changed.notify_all()
+        self._tell(session)
+
+    def _run(self) -> None:
+        before = self.session.state
+        while not self._closing.is_set():
+            self._wake.wait(1 / LOOK_HZ)
+            self._wake.clear()
+            state = self.session.state
+            try:
+                self._attend(state, before)
+            except (HeldError, StoppedError):  # somebody else has taken over
+                pass
+            except RobotFault as error:
+                self.fault(error)
+            except Exception as error:  # without this thread nobody would hold the arm
+                self.fault(RobotFault(f"Looking after the arm failed: {error!r}"))
+            before = state
+
+    def _attend(self, state: State, before: State) -> None:
+        guard = self.arm.guard
+        if state is State.STOPPED:
+            guard.stop()
+        elif state in IN_MOTION:
+            return
+        elif state is State.FAULTED:
+            self._recover()
+            return
+        elif before in IN_MOTION or (state is State.PAUSED and before is not state):
+            guard.hold()
+        if self.session.free != guard.released and state is not State.STOPPED:
+            guard.release() if self.session.free else guard.engage()
+        if self.session.take_home():
+            self._homeward = self.arm.home is not None
+        if state in BETWEEN and self._homeward:
+            self._bring_home()
+        elif state is not State.STOPPED:
+            self._show(guard.read().pictures)
+
+    def _bring_home(self) -> None:
+        """Steps towards home at the control rate, until it is there or something else comes up."""
+        self.session.note_homing(True)
+        try:
+            while self._homeward and not self._closing.is_set() and not self.session.free:
+                self._show(self.arm.guard.read().pictures)
+                self._homeward = not self.arm.step_home(lambda: self.session.state in BETWEEN)
+                time.sleep(1 / self.arm.fps)
+            self._homeward = False
+            self.arm.guard.hold()
+        finally:
+            self.session.note_homing(False)
+
+    def _recover(self) -> None:
+        try:
+            self.arm.guard.recover()
+        except RobotFault as error:
+            if self.session.fault != str(error):
+                self.fault(error)
+            self._closing.wait(RETRY_S)
+            return
+        with contextlib.suppress(RefusedError):  # stopped meanwhile
+            self.session.apply(Event.RECOVERED)

@@ -1,0 +1,235 @@
+"""The parts of a run on an arm, checked and put together: robot, leader, limits, home, page or keys."""
+
+import contextlib
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lerobot.configs.types import FeatureType
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.robots.robot import Robot
+from lerobot.robots.utils import make_robot_from_config
+from lerobot.teleoperators.utils import make_teleoperator_from_config
+from lerobot.utils.constants import ACTION, OBS_STATE
+from numpy.typing import NDArray
+
+from lerobot_cqn.errors import ConfigError, DataError, one_of
+
+from ..agent import Agent
+from ..config import DatasetSettings, RunConfig
+from ..demo.stages import read_rows
+from ..interfaces import PAGE_TOKEN
+from ..operator.board import Board
+from ..operator.session import Session
+from ..replay.demonstrations import load_metadata
+from ..robot.arm import Arm, state_names
+from ..robot.guard import Guard, GuardSettings
+from ..robot.limits import Forward, Limits
+from ..robot.settings import ArmSettings
+from .environment import ArmEnvironment
+
+__all__ = ["Operated", "make_operated", "recall", "steering"]
+
+Array = NDArray[np.float64]
+# Of a joint's range: the largest step where actions are goals, so that none says how far is usual.
+ABSOLUTE_SHARE = 0.05
+
+
+@dataclass(frozen=True)
+class Operated:
+    """An arm as the loop's environment, and what its person sees and says."""
+
+    env: ArmEnvironment
+    session: Session
+    board: Board
+
+
+def make_operated(
+    config: RunConfig, agent: Agent, should_stop: Callable[[], bool], say: Callable[[str], None]
+) -> Operated:
+    """Make robot and leader and check that they fit the policy; nothing is connected yet.
+
+    say: shows a warning. Raises ConfigError or DataError in one line.
+    """
+    assert config.robot is not None  # noqa: S101  # the caller asks only then
+    robot = _made("robot", make_robot_from_config, config.robot)
+    leader = _made("teleop", make_teleoperator_from_config, config.teleop) if config.teleop is not None else None
+    check_robot_fits(robot, agent)
+    meta = load_metadata(config.dataset) if config.dataset.repo_id else None
+    if meta is not None:
+        _check_names(robot, meta.features)
+    fps = config.arm.fps or (int(meta.fps) if meta is not None else None)
+    if fps is None:
+        raise ConfigError("How many control steps a second? Give --arm.fps (that of the demonstrations).")
+    limits = limits_of(robot, agent, config.arm, fps)
+    home = home_of(config.dataset, robot, config.arm) if meta is not None or config.arm.home else None
+    names = tuple(robot.action_features)
+    _check_home(home, names, limits)
+    settings = GuardSettings(config.arm.stale_s, config.arm.watchdog_s)
+    clutched = [i for i, name in enumerate(names) if "gripper" not in name]
+    arm = Arm(Guard(robot, limits, settings), config.arm, fps, leader=leader, clutched=clutched, home=home)
+    if agent.deltas is None:
+        say(
+            "Warning: the policy's actions are absolute goals, which may lie far from the arm; on real arms learn "
+            "differences (cqn-data delta, or the recipe paper_real_world)."
+        )
+    session = Session(leader=leader is not None, can_free=arm.guard.can_release)
+    board = Board(session)
+    if config.arm.on_exit == "hold" and getattr(config.robot, "disable_torque_on_disconnect", False):
+        say(
+            "Warning: this robot lets its motors go when it is disconnected, so the arm falls at the end of the run: "
+            "give --robot.disable_torque_on_disconnect=false to hold it."
+        )
+    return Operated(ArmEnvironment(arm, session, board, should_stop), session, board)
+
+
+@contextlib.contextmanager
+def steering(config: RunConfig, operated: Operated, say: Callable[[str], None]) -> Any:
+    """The operator's page, or keys in the terminal, while the block runs. Raises ConfigError without either."""
+    if not config.operator_page:
+        if not sys.stdin.isatty():
+            raise ConfigError("There is no terminal whose keys could steer the arm: leave out --operator_page=false.")
+        from ..operator.keys import TerminalKeys
+
+        with TerminalKeys(operated.session):
+            yield
+        return
+    from ..operator.page.server import OperatorServer
+
+    page, token = config.page, os.environ.get(PAGE_TOKEN) or None
+    with OperatorServer(operated.board, page.host, page.port, token, page.absent_s) as server:
+        say(f"Operator's page: {server.url}")
+        yield
+
+
+def recall(board: Board, output_dir: Path) -> None:
+    """Show what a resumed run did before: the rows of its tables."""
+    for table in ("episodes", "evaluations"):
+        for row in read_rows(output_dir / f"{table}.csv"):
+            numbers = {f"{table}/{name}": text for name, text in row.items() if text and name != "phase"}
+            board.log({name: float(text) for name, text in numbers.items()})
+
+
+def check_robot_fits(robot: Robot, agent: Agent) -> None:
+    """Cameras, state and action must be those of the policy. Raises ConfigError where they are not."""
+    needed, features = agent.policy.config.input_features or {}, robot.observation_features
+    cameras = [name for name, kind in features.items() if isinstance(kind, tuple)]
+    states = state_names(robot)
+    for key, feature in needed.items():
+        if feature.type is FeatureType.VISUAL and (name := key.rpartition(".")[2]) not in cameras:
+            raise ConfigError(one_of("camera of the robot", name, cameras) + " The policy was trained with it.")
+        if key == OBS_STATE and feature.shape[0] != len(states):
+            raise ConfigError(
+                f"The policy's state has {feature.shape[0]} values, the robot's {len(states)} ({', '.join(states)}): "
+                "use the robot and the options of the demonstrations."
+            )
+        if feature.type is FeatureType.ENV:
+            raise ConfigError(f"The policy needs '{key}', which only a simulator gives: train it without.")
+    if agent.policy.action_dims != len(robot.action_features):
+        raise ConfigError(
+            f"The policy's action has {agent.policy.action_dims} values, the robot takes {len(robot.action_features)} "
+            f"({', '.join(robot.action_features)}): use the robot of the demonstrations."
+        )
+
+
+def limits_of(robot: Robot, agent: Agent, settings: ArmSettings, fps: int) -> Limits:
+    """Limits from what the demonstrations did: their joints with a margin, their largest step with a factor.
+
+    Raises ConfigError for joints that are not the robot's, or where neither data nor settings say a limit.
+    """
+    names = tuple(robot.action_features)
+    states = state_names(robot)
+    for name in (*settings.joint_limits, *settings.home):
+        if name not in names:
+            raise ConfigError(one_of("joint", name, names))
+    action, state = agent.ranges(ACTION), agent.ranges(OBS_STATE)
+    deltas = agent.deltas
+    low: Array = np.zeros(len(names))
+    high, step = low.copy(), low.copy()
+    for i, name in enumerate(names):
+        delta = deltas is not None and i in deltas.action_dims
+        seen = state[:, states.index(name)] if state is not None and name in states else None
+        if action is None or (seen is None and delta):
+            raise ConfigError(f"No range of '{name}' in the policy's statistics: give --arm.joint_limits.")
+        if delta:
+            assert seen is not None  # noqa: S101  # checked above
+            low[i], high[i] = seen[0] + min(0.0, action[0, i]), seen[1] + max(0.0, action[1, i])
+            step[i] = settings.step_factor * np.abs(action[:, i]).max()
+        else:
+            low[i], high[i] = action[:, i]
+            if seen is not None:
+                low[i], high[i] = min(low[i], seen[0]), max(high[i], seen[1])
+            gripper = "gripper" in name
+            step[i] = (high[i] - low[i]) * (1.0 if gripper else settings.step_factor * ABSOLUTE_SHARE)
+        margin = settings.joint_margin * (high[i] - low[i])
+        low[i], high[i] = settings.joint_limits.get(name, (low[i] - margin, high[i] + margin))
+    step = np.maximum(step, 1e-3 * np.maximum(high - low, 1e-6))  # a joint that never moved
+    box = None
+    if settings.workspace is not None:
+        corners = np.array(settings.workspace, dtype=np.float64).reshape(3, 2)
+        box = corners[:, 0], corners[:, 1]
+    return Limits(low, high, step, step * fps, box, _forward(robot, settings) if box is not None else None)
+
+
+def home_of(dataset: DatasetSettings, robot: Robot, settings: ArmSettings) -> Array:
+    """Where the demonstrations start: the median of their first joints [D]; `arm.home` on top. Raises ConfigError."""
+    names, home = tuple(robot.action_features), dict[str, float]()
+    if dataset.repo_id:
+        data = LeRobotDataset(dataset.repo_id, root=dataset.root, episodes=dataset.episodes)
+        columns = data.hf_dataset.with_format("numpy")
+        first = np.unique(np.asarray(columns["episode_index"]), return_index=True)[1]
+        states = state_names(robot)
+        if OBS_STATE in data.features:
+            median = np.median(np.stack([columns[int(row)][OBS_STATE] for row in first]), axis=0)
+            home = dict(zip(states, median.tolist(), strict=True))
+    home |= settings.home
+    missing = [name for name in names if name not in home]
+    if missing:
+        raise ConfigError(f"Where is home for '{missing[0]}'? Give it, e.g. --arm.home='{{{missing[0]}: 0}}'.")
+    return np.array([home[name] for name in names])
+
+
+def _check_home(home: Array | None, names: tuple[str, ...], limits: Limits) -> None:
+    """An arm would never arrive at a home that its limits keep it from. Raises ConfigError."""
+    for i, name in enumerate(names):
+        if home is not None and not limits.low[i] - 1e-6 <= home[i] <= limits.high[i] + 1e-6:
+            raise ConfigError(
+                f"Home of '{name}' is {home[i]:g}, its limits are {limits.low[i]:g} to {limits.high[i]:g}: give "
+                "another --arm.home or --arm.joint_limits."
+            )
+
+
+def _made(kind: str, make: Callable[[Any], Any], config: Any) -> Any:
+    try:
+        return make(config)
+    except Exception as error:  # drivers raise many kinds, and miss packages
+        raise ConfigError(f"The device of --{kind}.type cannot be made: {error}") from error
+
+
+def _check_names(robot: Robot, features: dict[str, Any]) -> None:
+    """A robot with other joints, or in another order, would be driven wrongly. Raises DataError."""
+    states = state_names(robot)
+    for key, own in ((OBS_STATE, states), (ACTION, list(robot.action_features))):
+        names = features.get(key, {}).get("names")
+        if isinstance(names, list | tuple) and list(names) != own:
+            raise DataError(f"The dataset's {key} is {list(names)}, the robot's {own}: use the robot of the dataset.")
+
+
+def _forward(robot: Robot, settings: ArmSettings) -> Forward:
+    """Joints [D] -> tip [3], m: the robot's own `tip_position`, or from a URDF. Raises ConfigError without either."""
+    names, own = list(robot.action_features), getattr(robot, "tip_position", None)
+    if callable(own):
+        return lambda joints: np.asarray(own(dict(zip(names, joints.tolist(), strict=True))), dtype=np.float64)
+    if not settings.urdf:
+        raise ConfigError("--arm.workspace needs the arm's kinematics: give --arm.urdf=FILE (and --arm.tip).")
+    try:
+        from lerobot.model.kinematics import RobotKinematics
+
+        kinematics = RobotKinematics(settings.urdf, settings.tip)
+    except Exception as error:  # the package is missing, or it cannot read the file
+        raise ConfigError(f"--arm.urdf={settings.urdf} cannot be used: {error}") from error
+    return lambda joints: np.asarray(kinematics.forward_kinematics(joints)[:3, 3], dtype=np.float64)

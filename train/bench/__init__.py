@@ -1,0 +1,1 @@
+"""`cqn-bench`: methods, tasks and seeds compared."""

@@ -1,0 +1,285 @@
+"""`cqn-bench`: runs of `cqn-train` over methods, tasks and seeds, several at a time, and what they come to together.
+
+A run that is complete is not repeated, one that was cut off continues from its checkpoint: the same command again
+finishes what is left. See `benchmarks/*.yaml` for plans.
+"""
+
+import csv
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from cqn_data.terminal.console import explain
+from lerobot_cqn.errors import ConfigError, CQNError, one_of
+
+__all__ = ["Plan", "Run", "load_plan", "main", "runs_of"]
+
+HELP = """cqn-bench: train every method on every task with every seed, then compare.
+
+Usage: cqn-bench PLAN.yaml --output_dir=DIR [--processes=2] [--report_only] [--debug]
+
+A plan is a YAML file:
+
+  common: [--steps=2400, --offline_updates=150, --threads=1]     # arguments of cqn-train for every run
+  methods:
+    cqn: [--policy.type=cqn, --policy.preset=laptop_state]
+    cbc: [--policy.type=cqn, --policy.preset=laptop_state, --policy.rl_loss_scale=0, --relabel=false]
+  tasks:
+    click_button: [--env.type=ur5e_station, --env.task=click_button, --dataset.repo_id=local/click_f,
+                   --dataset.root=data/click_f]
+  seeds: [1, 2, 3]
+  score: success_rate                                            # or mean_return, for tasks without success
+
+DIR/TASK/METHOD/SEED is a run as cqn-train leaves it; DIR/results.csv, results.md, table.png, aggregate.png, curves.csv
+and curves.png are made anew at the end (they need pip install 'lerobot_policy_cqn[bench]'). Ctrl-C stops all runs with
+their checkpoints; the same command continues.
+"""
+STOPS_WITHIN_S = 60.0  # seconds that runs have to save after Ctrl-C
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to run: arguments of `cqn-train` by method and by task, seeds, and what all have in common."""
+
+    methods: Mapping[str, Sequence[str]]
+    tasks: Mapping[str, Sequence[str]]
+    seeds: Sequence[int]
+    common: Sequence[str] = ()
+    score: str = "success_rate"
+
+    @property
+    def digits(self) -> int:
+        """Decimals of a score in tables."""
+        return 2 if self.score == "success_rate" else 0
+
+
+@dataclass
+class Run:
+    """One training run and how far it is."""
+
+    task: str
+    method: str
+    seed: int
+    folder: Path
+    arguments: list[str]
+    state: str = "waiting"
+    process: "subprocess.Popen[bytes] | None" = field(default=None, repr=False)
+
+    def rows(self) -> list[dict[str, str]]:
+        """Its evaluations so far."""
+        path = self.folder / "evaluations.csv"
+        if not path.is_file():
+            return []
+        with path.open(newline="") as file:
+            return list(csv.DictReader(file))
+
+    def last_words(self) -> str:
+        """Last line of its log, and where it is."""
+        path = self.folder.with_suffix(".log")
+        lines = path.read_text(errors="replace").split("\n") if path.is_file() else []
+        said = next((line.strip() for line in reversed(lines) if line.strip()), "")
+        return f"{said} (log: {path})" if said else f"see {path}"
+
+    @property
+    def done(self) -> bool:
+        """Whether it has its final evaluation."""
+        return any(row["phase"] == "final" for row in self.rows())
+
+    def start(self) -> None:
+        """Begin, or continue from its last checkpoint; what it prints goes to a log beside its folder."""
+        resumes = (self.folder / "checkpoints" / "last").exists()
+        target = [f"--output_dir={self.folder}"]
+        arguments = ["--resume=true", *target] if resumes else [*self.arguments, *target]
+        self.folder.parent.mkdir(parents=True, exist_ok=True)
+        with self.folder.with_suffix(".log").open("ab") as log:
+            command = [sys.executable, "-m", "cqn_train.cli", *arguments]
+            self.process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
+        self.state = "running"
+
+    def look(self) -> None:
+        """Notice that it has ended."""
+        if self.process is None or self.process.poll() is None:
+            return
+        code = self.process.returncode
+        self.state = "done" if code == 0 and self.done else "stopped" if code == 130 else "failed"
+        self.process = None
+
+
+def load_plan(path: Path) -> Plan:
+    """Read a plan. Raises ConfigError when it is not there or not of the form that `HELP` shows."""
+    if not path.is_file():
+        raise ConfigError(f"No plan at {path}: give a YAML file, as cqn-bench --help shows.")
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    keys = ("common", "methods", "tasks", "seeds", "score")
+    if not isinstance(content, Mapping):
+        raise ConfigError(f"{path}: expected the keys {', '.join(keys)}.")
+    for key in content:
+        if key not in keys:
+            raise ConfigError(f"{path}: " + one_of("key", str(key), keys))
+    plan = Plan(content.get("methods") or {}, content.get("tasks") or {}, content.get("seeds") or [],
+                content.get("common") or [], content.get("score", "success_rate"))  # fmt: skip
+    for name in ("methods", "tasks"):
+        table: Any = getattr(plan, name)
+        if not isinstance(table, Mapping) or not table or not all(_flags(flags) for flags in table.values()):
+            raise ConfigError(f"{path}: expected {name} as NAME: [--flag=value, …], at least one.")
+        for entry in table:
+            if not str(entry).replace("_", "").replace("-", "").replace(".", "").isalnum():
+                raise ConfigError(f"{path}: '{entry}' becomes a folder: expected letters, digits, '_', '-' and '.'.")
+    if not _flags(plan.common):
+        raise ConfigError(f"{path}: expected common as a list of --flag=value.")
+    if plan.score not in (valid := ("success_rate", "mean_return")):
+        raise ConfigError(f"{path}: " + one_of("score", str(plan.score), valid))
+    if not plan.seeds or not all(isinstance(seed, int) and seed >= 0 for seed in plan.seeds):
+        raise ConfigError(f"{path}: expected seeds as a list of whole numbers, got {plan.seeds}.")
+    return plan
+
+
+def runs_of(plan: Plan, folder: Path) -> list[Run]:
+    """All runs, seeds first, so that every method has a first result early."""
+    runs = []
+    for seed in plan.seeds:
+        for task, of_task in plan.tasks.items():
+            for method, of_method in plan.methods.items():
+                arguments = [*plan.common, *of_method, *of_task, f"--seed={seed}"]
+                runs.append(Run(task, method, seed, folder / task / method / str(seed), arguments))
+    return runs
+
+
+def work(runs: Sequence[Run], processes: int, console: Console, score: str = "success_rate") -> None:
+    """Run all that are not done, `processes` at a time. Raises KeyboardInterrupt once all have stopped and saved."""
+    for run in runs:
+        run.state = "done" if run.done else "waiting"
+    waiting = [run for run in runs if run.state != "done"]
+    begun = time.monotonic()
+    try:
+        with Live(_table(runs, score), console=console, refresh_per_second=1) as live:
+            while waiting or any(run.process for run in runs):
+                running = [run for run in runs if run.process]
+                for run in waiting[: processes - len(running)]:
+                    run.start()
+                    waiting.remove(run)
+                time.sleep(0.3)
+                for run in running:
+                    run.look()
+                    if run.state not in ("running", "done"):
+                        console.print(f"{run.task} / {run.method} / {run.seed} {run.state}: {run.last_words()}")
+                live.update(_table(runs, score, time.monotonic() - begun))
+    except KeyboardInterrupt:
+        console.print("\nStopping: the runs are saving their checkpoints ...")
+        _stop([run for run in runs if run.process])
+        raise
+    if not console.is_terminal:
+        console.print()
+
+
+def check(runs: Sequence[Run]) -> None:
+    """Parse the arguments of every method on every task, before hours of work. Raises ConfigError for a bad one."""
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    from .. import envs  # noqa: F401  # registers our environments
+    from ..arguments import parse
+
+    register_third_party_plugins()
+    seen = set()
+    for run in runs:
+        if (run.method, run.task) not in seen and run.state != "done":
+            seen.add((run.method, run.task))
+            try:
+                parse([*run.arguments, f"--output_dir={run.folder}"]).validate()
+            except CQNError as error:
+                raise ConfigError(f"{run.task} / {run.method}: {error}") from error
+
+
+def _stop(runs: Sequence[Run]) -> None:
+    for run in runs:
+        if run.process:
+            run.process.send_signal(signal.SIGINT)
+    deadline = time.monotonic() + STOPS_WITHIN_S
+    for run in runs:
+        if run.process:
+            try:
+                run.process.wait(max(0.1, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                run.process.kill()
+                run.process.wait()
+
+
+def _table(runs: Sequence[Run], score: str, seconds: float = 0.0) -> Table:
+    """Every run with its latest success rate; what is left of the time, judged by what is done."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("task", "method", "seed", "state", "step", score.replace("_", " ")):
+        table.add_column(name)
+    for run in runs:
+        rows = run.rows()
+        last = rows[-1] if rows else {}
+        table.add_row(run.task, run.method, str(run.seed), run.state, last.get("env_steps", ""),
+                      f"{float(last[score]):.2f}" if last else "")  # fmt: skip
+    done = sum(run.state == "done" for run in runs)
+    table.caption = f"{done} of {len(runs)} done, {seconds / 60:.0f} min"
+    return table
+
+
+def _flags(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(v, str) and v.startswith("--") for v in value)
+
+
+def _options(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
+    known = ("--output_dir", "--processes", "--report_only")
+    for argument in arguments:
+        name, _, value = argument.partition("=")
+        if name not in known:
+            raise ConfigError(one_of("option", name, known))
+        yield name[2:], value
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `cqn-bench`; returns 0, 1 when a run failed, 2 for an error of the user's, 130 after an interrupt."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in arguments
+    arguments = [a for a in arguments if a != "--debug"]
+    console = Console(highlight=False, soft_wrap=True)
+    if not arguments or "-h" in arguments or "--help" in arguments:
+        console.print(HELP, markup=False)
+        return 0
+    try:
+        if arguments[0].startswith("--"):
+            raise ConfigError("Name a plan first: cqn-bench PLAN.yaml --output_dir=DIR.")
+        options = dict(_options(arguments[1:]))
+        if not options.get("output_dir"):
+            raise ConfigError("No output directory: give --output_dir=DIR.")
+        processes = options.get("processes", "2")
+        if not processes.isdigit() or int(processes) < 1:
+            raise ConfigError(f"Expected --processes of at least 1, got '{processes}'.")
+        folder = Path(options["output_dir"])
+        from .report import check_packages, write_report
+
+        check_packages()
+        plan = load_plan(Path(arguments[0]))
+        runs = runs_of(plan, folder)
+        if "report_only" not in options:
+            check([run for run in runs if not run.done])
+            work(runs, int(processes), console, plan.score)
+        write_report(plan, runs, folder, console)
+    except KeyboardInterrupt:
+        console.print("Stopped; the same command continues.")
+        return 130
+    except (CQNError, OSError) as error:
+        return int(explain("cqn-bench", error, debug=debug))
+    return int(any(run.state in ("failed", "stopped") for run in runs))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,170 @@
+"""`make demo-arm`: lerobot-record on the simulated arm -> dataset recipe -> CQN online, with a simulated person.
+
+Everything runs as on a real arm: the demonstrations are recorded by LeRobot's own command, the arm moves by the clock,
+and the person answers at the operator's page. Interrupted at any moment, it continues where it was when started again.
+"""
+
+import json
+import os
+import secrets
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from ..interfaces import PAGE_TOKEN
+from .stages import Stages, fresh, read_rows, run_once
+
+__all__ = ["ArmDemoConfig", "main", "run_demo"]
+
+CLOCK = 4  # simulated seconds in a real one
+RATE = 10  # control steps in a simulated second
+LOG_EVERY_S = 30.0
+
+
+@dataclass(frozen=True)
+class ArmDemoConfig:
+    """Size of the demo; the defaults fit 2 CPU cores and 10 minutes."""
+
+    output_dir: Path = Path("outputs/demo-arm")
+    demonstrations: int = 20
+    offline_updates: int = 60
+    steps: int = 1800
+    helped_episodes: int = 15  # in which the simulated person takes over where a try takes long
+    eval_episodes: int = 40
+    episode_s: float = 6.5  # simulated
+    port: int = 8765
+    seed: int = 0
+
+
+def run_demo(config: ArmDemoConfig, console: Console) -> dict[str, Any]:
+    """Everything, in order; returns what `summary.json` holds. Raises DemoError when a command fails."""
+    from .figures import arm_session
+
+    stages = Stages(config.output_dir, console)
+    raw, clean, run = (config.output_dir / name for name in ("data/raw", "data/clean", "run"))
+    arm = ("--robot.type=sim_ur5e", f"--robot.speed={CLOCK}", "--robot.state=true", f"--robot.seed={config.seed}")
+    with stages.timed():
+        stages.run(
+            "record", f"lerobot-record: {config.demonstrations} demonstrations", raw,
+            "cqn_train.sim_arm.keyboard", "lerobot-record", *arm, "--robot.id=demo", "--robot.camera_names=[]",
+            "--teleop.type=sim_leader", "--teleop.id=demo", "--teleop.pause_share=0.3", "--teleop.hold_s=0.5",
+            "--dataset.repo_id=demo/raw", f"--dataset.root={raw}", f"--dataset.fps={CLOCK * RATE}",
+            f"--dataset.num_episodes={config.demonstrations}", "--dataset.single_task=Press the red button.",
+            "--dataset.episode_time_s=60", "--dataset.reset_time_s=60", "--dataset.push_to_hub=false",
+            "--play_sounds=false",
+        )  # fmt: skip
+        stages.run(
+            "recipe", "cqn-data: pauses out, joint differences, bounds", clean, "cqn_data.cli", "run", "arm_state",
+            "--repo_id=demo/raw", f"--root={raw}", "--new_repo_id=demo/clean", f"--new_root={clean}",
+        )  # fmt: skip
+        _train(stages, config, clean, run, arm)
+    episodes, evaluations = read_rows(run / "episodes.csv"), read_rows(run / "evaluations.csv")
+    summary = {
+        "config": {name: str(value) for name, value in vars(config).items()},
+        "wall_s": round(stages.seconds(), 1),
+        "online_minutes": round(_online_minutes(run), 2),
+        "episodes": len(episodes),
+        "taught_steps": sum(int(row["taught"]) for row in episodes),
+        **{
+            phase: {name: float(row[name]) for name in ("success_rate", "successes", "n", "ci_low", "ci_high")}
+            for row in evaluations
+            if (phase := row["phase"]) in ("offline", "final")
+        },
+        "control": _last_line(stages.logs / "train.log", "Control:"),
+    }
+    (config.output_dir / "session.png").write_bytes(arm_session(episodes, evaluations))
+    (config.output_dir / "summary.json").write_text(json.dumps(summary, indent=2))
+    return summary
+
+
+def _train(stages: Stages, config: ArmDemoConfig, data: Path, run: Path, arm: tuple[str, ...]) -> None:
+    """Online training with a progress bar, from the last checkpoint where there is one."""
+    if any(row["phase"] == "final" for row in read_rows(run / "evaluations.csv")):
+        return
+    stages.environment[PAGE_TOKEN] = os.environ.get(PAGE_TOKEN) or secrets.token_urlsafe(16)
+    if (run / "checkpoints" / "last").exists():
+        arguments = ["--resume=true", f"--output_dir={run}"]
+    else:
+        arguments = [
+            "--policy.type=cqn", "--policy.preset=laptop_state", "--policy.device=cpu", *arm,
+            "--robot.camera_names=[left_shoulder]", "--robot.image_height=168", "--robot.image_width=224",
+            f"--robot.person=http://127.0.0.1:{config.port}", "--robot.person_takes_over_s=3.5",
+            f"--robot.person_helps_episodes={config.helped_episodes}",
+            "--teleop.type=sim_leader", "--dataset.repo_id=demo/clean", f"--dataset.root={data}",
+            f"--output_dir={fresh(run)}", f"--seed={config.seed}", f"--offline_updates={config.offline_updates}",
+            f"--steps={config.steps}", f"--eval.final_n_episodes={config.eval_episodes}",
+            f"--arm.episode_s={config.episode_s / CLOCK}", f"--page.port={config.port}", "--threads=1",
+            "--updates_per_episode=100", "--save_freq=500",
+        ]  # fmt: skip
+    process = stages.start("train", "cqn_train.cli", *arguments)
+    page = f"http://127.0.0.1:{config.port}/?token={stages.environment[PAGE_TOKEN]}"
+    stages.console.print(f"  watch it at the operator's page: {page}", soft_wrap=True)
+    columns = (TextColumn("  {task.description}"), BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("eta"),
+               TimeRemainingColumn(), TextColumn("{task.fields[note]}"))  # fmt: skip
+    with Progress(*columns, console=stages.console) as bar:
+        task, told = bar.add_task("online training", total=config.steps, note="imitation first"), time.monotonic()
+        try:
+            while process.poll() is None:
+                done, note = _progress(run, config)
+                bar.update(task, completed=done, note=note)
+                if not stages.console.is_terminal and time.monotonic() - told > LOG_EVERY_S:
+                    told = time.monotonic()
+                    stages.console.print(f"  online training {done}/{config.steps}  {note}")
+                time.sleep(1.0)
+        except KeyboardInterrupt:  # it has received the signal too, and is saving
+            process.wait()
+            raise
+    stages.check("train", process.returncode)
+
+
+def _progress(run: Path, config: ArmDemoConfig) -> tuple[int, str]:
+    episodes, evaluations = read_rows(run / "episodes.csv"), read_rows(run / "evaluations.csv")
+    if not evaluations:
+        return 0, f"imitation, then {config.eval_episodes} episodes to evaluate it"
+    if not episodes:
+        return 0, f"success {float(evaluations[-1]['success_rate']):.2f} after imitation"
+    lately = [int(row["success"]) for row in episodes[-5:]]
+    return int(episodes[-1]["env_steps"]), f"episode {len(episodes)}, {sum(lately)} of the last {len(lately)} succeed"
+
+
+def _online_minutes(run: Path) -> float:
+    progress = json.loads((run / "checkpoints/last/training_state/progress.json").read_text())
+    return float(progress["counters"]["online_s"]) / 60
+
+
+def _last_line(log: Path, begin: str) -> str:
+    lines = [line.strip() for line in log.read_text(errors="replace").splitlines()]
+    return next((line for line in reversed(lines) if line.startswith(begin)), "")
+
+
+def show(summary: dict[str, Any], config: ArmDemoConfig, console: Console) -> None:
+    """The short table at the end."""
+    table = Table(title="click_button on the simulated arm, judged by the simulated person", title_justify="left")
+    for column, side in (("policy", "left"), ("success", "right"), ("95 % interval", "right")):
+        table.add_column(column, justify="right" if side == "right" else "left")
+    after = f"after {summary['online_minutes']:.1f} minutes online, {summary['episodes']} episodes"
+    for phase, text in (("offline", f"imitation of {config.demonstrations} demonstrations"), ("final", after)):
+        row = summary[phase]
+        table.add_row(
+            text, f"{row['success_rate']:.2f} ({row['successes']:.0f}/{row['n']:.0f})",
+            f"{row['ci_low']:.2f} - {row['ci_high']:.2f}",
+        )  # fmt: skip
+    console.print(table)
+    console.print(f"{summary['control']}\npicture  {config.output_dir / 'session.png'}", soft_wrap=True)
+    console.print(f"policy   {config.output_dir / 'run' / 'checkpoints' / 'last' / 'pretrained_model'}")
+
+
+def main() -> int:
+    """Entry of `python -m cqn_train.demo.arm`."""
+    introduction = "CQN on a simulated arm with a simulated person at the operator's page: about 10 minutes"
+    return run_once("demo-arm", ArmDemoConfig, introduction, run_demo, show)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""The training loop, its evaluations, and the environments it acts in."""

@@ -1,0 +1,298 @@
+"""The loop: offline updates on the demonstrations, then acting and learning (Algorithm 2)."""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from lerobot_cqn.learner import Learner, NonFiniteLossError
+from lerobot_cqn.schema import Batch
+
+from ..agent import Agent, Recorder
+from ..config import RunConfig
+from ..interfaces import Environment, Interrupted, Label, Outcome, Person, Scenes
+from ..replay.buffer import Episode, Replay
+from ..replay.files import Place
+from ..run.checkpoint import Counters
+from ..run.first_look import save_batch, write_films
+from ..run.metrics import Metrics
+from .background import Background
+from .evaluate import Evaluation, evaluate
+
+__all__ = ["Monitor", "Nobody", "Trainer"]
+
+RECENT = 20  # training episodes in the progress line
+SET_ASIDE = 5  # discarded episodes that may still be labelled otherwise
+
+
+class Monitor(Protocol):
+    """What a person sees while it runs."""
+
+    def phase(self, name: str, total: int, done: int) -> None:
+        """A phase of `total` units begins, `done` of them already behind."""
+        ...
+
+    def advance(self, done: int, note: str) -> None:
+        """Progress within the phase."""
+        ...
+
+    def message(self, text: str) -> None:
+        """A line that stays."""
+        ...
+
+
+class Nobody:
+    """The person of an environment that judges for itself."""
+
+    def expect(self, number: int | None) -> None:
+        """There is nobody to tell."""
+
+    def learning(self, doing: str) -> None:
+        """There is nobody to tell."""
+
+    def take_relabelled(self) -> dict[int, Label]:
+        """Nothing."""
+        return {}
+
+
+@dataclass
+class Trainer:
+    """Everything the loop touches; made by `cli.py`, the only composition root."""
+
+    config: RunConfig
+    agent: Agent
+    learner: Learner
+    env: Environment
+    scenes: Scenes
+    replay: Replay
+    metrics: Metrics
+    monitor: Monitor
+    rng: np.random.Generator
+    counters: Counters
+    save: Callable[[], None]
+    should_stop: Callable[[], bool]
+    evaluations: list[tuple[str, Evaluation]] = field(default_factory=list)
+    finished_since: Sequence[Place] = ()
+    person: Person = field(default_factory=Nobody)
+    _aside: dict[int, tuple[Episode, dict[str, Any]]] = field(default_factory=dict)
+    _recent: list[bool] = field(default_factory=list)
+    _clock: float = field(default_factory=time.monotonic)
+
+    def run(self) -> None:
+        """Offline phase, online phase, final evaluation. Raises Interrupted between two updates or steps."""
+        self.env.open()
+        self.take_up(self.finished_since)
+        try:
+            if not self.counters.offline_done:
+                self._offline()
+            self._online()
+            self.evaluate("final", self.config.final_episodes)
+        finally:
+            self._relabel()  # what was said since the last episode, before a stop
+        self.save()
+
+    def _offline(self) -> None:
+        total = self.config.offline_updates
+        self.monitor.phase("offline", total, self.counters.updates)
+        self.person.learning("offline updates")
+        self.updates(total - self.counters.updates, on_update=lambda: self.monitor.advance(self.counters.updates, ""))
+        if total and self.config.steps:
+            self.evaluate("offline", self.config.final_episodes)
+        self.counters.offline_done = True
+        self.save()
+
+    def _online(self) -> None:
+        c = self.counters
+        self.monitor.phase("online", self.config.steps, c.env_steps)
+        while c.env_steps < self.config.steps and not self._out_of_time():
+            before, number, began, waited = c.env_steps, c.episodes, time.monotonic(), self.env.waited_s
+            try:
+                self.episode()
+            except Interrupted:  # the unfinished episode is dropped, so its steps do not count either
+                c.env_steps = before if c.episodes == number else c.env_steps
+                raise
+            self._relabel()
+            self.updates(self.config.recipe.updates_per_episode, on_update=self._tell_updates)
+            c.online_s += time.monotonic() - began - (self.env.waited_s - waited)
+            self._look_and_save(before)
+
+    def _look_and_save(self, before: int) -> None:
+        """Evaluate and save where the steps since `before` say so."""
+        c, freq = self.counters, self.config.eval_freq
+        if freq and c.env_steps // freq > before // freq and c.env_steps < self.config.steps:
+            self.evaluate("online", self.config.eval.n_episodes)
+        if c.env_steps // self.config.save_freq > before // self.config.save_freq:
+            self.person.learning("saving a checkpoint")
+            self.save()
+
+    def episode(self) -> None:
+        """Act once from reset to end, learn while acting, and store what happened."""
+        c, recorder = self.counters, Recorder(self.agent)
+        self.agent.reset()
+        self.person.expect(c.episodes)
+        # The seed follows from the episode's number: a resumed run meets the same scenes.
+        prepared = self.agent.prepare(self.env.reset(self.config.seed * 100_000 + c.episodes))
+        recorder.observe(prepared)
+        q_values: list[float] = []
+        ended = False
+        try:
+            with self._background() as agent:
+                while len(recorder) < self.env.max_steps:
+                    action, q = agent.act(prepared, explore=True)
+                    outcome = self.env.step(agent.postprocessor(action))
+                    executed = agent.carried_out(action, outcome)
+                    prepared = agent.prepare(outcome.frame)
+                    if outcome.skipped:
+                        recorder.retake(prepared, outcome.reward)
+                        agent.retake(first=not len(recorder))
+                    else:
+                        recorder.step(executed, outcome.reward, taught=outcome.taught)
+                        recorder.observe(prepared)
+                        q_values.append(q)
+                        c.env_steps += 1
+                        self.updates(self.config.recipe.updates_per_step)
+                    if self.should_stop():
+                        raise Interrupted
+                    if outcome.ended:
+                        break
+                ended = True
+        finally:
+            if ended:  # also where the learner beside it failed: the person's work is not lost
+                self._store(recorder, outcome, float(np.mean(q_values)) if q_values else float("nan"))
+
+    def _store(self, recorder: Recorder, outcome: Outcome, mean_q: float) -> None:
+        """Keep a finished episode and say how it went."""
+        c, number = self.counters, self.counters.episodes
+        c.episodes += 1
+        if not len(recorder):
+            self.monitor.message(f"Episode {number} had no step.")
+            return
+        episode = recorder.episode(terminated=outcome.terminated, success=outcome.success)
+        demo = self.config.recipe.relabel and outcome.success
+        row = {
+            "episode": number, "length": len(episode), "success": int(outcome.success),
+            "return": float(episode.reward.sum()), "mean_q": mean_q, "taught": sum(recorder.taught),
+            "demonstrations": self.replay.demonstrations + demo, **self._progress(),
+        }  # fmt: skip
+        if outcome.discarded:
+            self._aside = dict([*self._aside.items(), (number, (episode, row))][-SET_ASIDE:])
+            self.monitor.message(f"Episode {number} is discarded: nothing is learned from it.")
+            return
+        self.replay.add(episode, demo=demo, number=number, note=row)
+        self.metrics.write("episodes", row)
+        self._recent = [*self._recent, outcome.success][-RECENT:]
+        lately = f"success {sum(self._recent)}/{len(self._recent)} lately"
+        self.monitor.advance(c.env_steps, f"episode {c.episodes}  {lately}  Q {mean_q:+.2f}")
+
+    def _relabel(self) -> None:
+        """Learn from now on what a person says otherwise about finished episodes."""
+        for number, label in self.person.take_relabelled().items():
+            success = label is Label.SUCCESS
+            demo = self.config.recipe.relabel and success
+            if number in self._aside and label is not Label.DISCARD:
+                episode, row = self._aside.pop(number)
+                self.replay.add(replace(episode, terminated=True), demo=demo, number=number, note=row)
+                self.metrics.write("episodes", row | {"success": int(success)})
+                there = self.replay.relabel(number, success=success, demo=demo)
+            elif label is Label.DISCARD:
+                there = self.replay.forget(number)
+            else:
+                there = self.replay.relabel(number, success=success, demo=demo)
+            gone = "" if there else " It is not in the replay any more: nothing changes."
+            self.monitor.message(f"Episode {number} is a {label} now.{gone}")
+
+    def _out_of_time(self) -> bool:
+        minutes = self.config.online_minutes
+        return minutes is not None and self.counters.online_s >= 60 * minutes
+
+    def _tell_updates(self) -> None:
+        self.person.learning(f"update {self.counters.updates}")
+
+    @contextlib.contextmanager
+    def _background(self) -> Iterator[Agent]:
+        """The agent that acts in an episode: with asynchronous updates a copy, while the original learns beside it."""
+        if not self.config.async_updates:
+            yield self.agent
+            return
+        acting = replace(self.agent, policy=deepcopy(self.agent.policy))
+        with Background(lambda stop: self.updates(self.config.async_updates, until=stop)):
+            yield acting
+
+    def updates(
+        self, count: int, on_update: Callable[[], None] = lambda: None, until: Callable[[], bool] = lambda: False
+    ) -> None:
+        """Gradient updates on batches from both stores, the next one put together meanwhile."""
+        if not self.replay.episodes:  # without demonstrations learning begins after the first episode
+            return
+        sizes = self.config.recipe.batch_size, self.config.recipe.demo_batch_size
+        with contextlib.closing(self.replay.batches(count, *sizes, self.rng)) as batches:
+            for batch in batches:
+                stats = self._update(batch)
+                self.counters.updates += 1
+                if self.counters.updates % self.config.log_freq == 0:
+                    losses = {name: float(value) for name, value in stats.items()}
+                    self.metrics.write("updates", losses | self._progress())
+                on_update()
+                if self.should_stop():
+                    raise Interrupted
+                if until():
+                    break
+
+    def _update(self, batch: Batch) -> dict[str, Any]:
+        try:
+            return self.learner.update(batch)
+        except NonFiniteLossError as error:
+            path = self.metrics.output_dir / "bad_batch.pt"
+            save_batch(batch, path)
+            raise NonFiniteLossError(f"{error} The batch is in {path}.") from error
+
+    def take_up(self, places: Sequence[Place]) -> None:
+        """Episodes that were finished after the last checkpoint: they count, and their updates are made again."""
+        recipe, owed = self.config.recipe, 0
+        # By number: an episode that was discarded at first was stored after later ones.
+        for place in sorted(places, key=lambda place: place.number):
+            self.metrics.write("episodes", place.note)
+            self.counters.episodes, self.counters.env_steps = place.number + 1, int(place.note["env_steps"])
+            owed += place.length * recipe.updates_per_step + recipe.updates_per_episode
+        if places:
+            self.monitor.message(
+                f"{len(places)} episodes that ended after the last checkpoint are kept; their {owed} updates are made "
+                "again."
+            )
+        self.updates(owed)
+
+    def evaluate(self, phase: str, episodes: int) -> None:
+        """Success rate of the deterministic policy; its random state is kept apart from training's."""
+        if not episodes:
+            return
+
+        def look(_: int) -> None:
+            if self.should_stop():
+                raise Interrupted
+
+        self.person.expect(None)
+        films = self.config.eval.videos
+        result = evaluate(self.agent, self.scenes, episodes, on_episode=look, film=films)
+        if films:
+            stem = f"{phase}_{self.counters.env_steps:06d}"
+            write_films(result.frames, result.outcomes, self.metrics.output_dir / "videos", stem, self.env.fps)
+        self.evaluations.append((phase, result))
+        low, high = result.interval
+        row = {
+            "phase": phase, "episodes": self.counters.episodes, "n": result.n, "successes": result.successes,
+            "success_rate": result.success_rate, "ci_low": low, "ci_high": high,
+            "mean_length": float(np.mean(result.steps)), "mean_return": result.mean_return,
+        }  # fmt: skip
+        self.metrics.write("evaluations", row | self._progress())
+        self.monitor.message(f"{phase:>8}  step {self.counters.env_steps:>6}  {result}")
+
+    def _progress(self) -> dict[str, float]:
+        now = time.monotonic()
+        self.counters.wall_s += now - self._clock
+        self._clock = now
+        c = self.counters
+        return {"env_steps": c.env_steps, "updates": c.updates, "wall_s": round(c.wall_s, 2)}

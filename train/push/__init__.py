@@ -1,0 +1,1 @@
+"""`cqn-push`: a run's policy to the Hub."""

@@ -1,0 +1,1 @@
+"""Episodes: how they are recorded, read from a dataset, stored and sampled."""

@@ -1,0 +1,393 @@
+"""Replay buffer: whole episodes, stored once; histories and n-step windows are put together when sampled."""
+
+import json
+from collections.abc import Generator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lerobot_cqn.errors import ConfigError, DataError
+from lerobot_cqn.schema import Batch, Observation
+
+from .files import Journal, Place, Rows
+
+__all__ = ["Episode", "Replay"]
+
+GIB = 2**30
+BATCHES = 4  # whose pictures are in memory at a time
+SAMPLED = [("start", int), ("length", int), ("terminated", bool), ("demo", bool), ("first", int), ("last", int)]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode of T steps and T + 1 observations.
+
+    low_dim: float32 [T + 1, P], normalised (None without state); pixels: per view uint8 [T + 1, 3, H, W];
+    action: float32 [T, D] in [-1, 1]; reward: float32 [T].
+    terminated: the last step really ended the task (success); otherwise time ran out and the last
+    observation's value still counts. taught: the steps (first, one past the last) that a person drove.
+    """
+
+    low_dim: NDArray[Any] | None
+    pixels: tuple[NDArray[Any], ...]
+    action: NDArray[Any]
+    reward: NDArray[Any]
+    terminated: bool
+    success: bool
+    taught: tuple[tuple[int, int], ...] = ()
+
+    def __len__(self) -> int:
+        """Steps, T."""
+        return len(self.action)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What is stored, T + 1 rows each: a row of its own for the last observation keeps one index for all."""
+        state = self.low_dim if self.low_dim is not None else np.zeros((len(self) + 1, 0), np.float32)
+        rows = {"low_dim": state.astype(np.float32)}
+        for name, values in (("action", self.action), ("reward", self.reward)):
+            rows[name] = np.concatenate([values, np.zeros_like(values[:1])]).astype(np.float32)
+        return rows | {f"view_{i}": view for i, view in enumerate(self.pixels)}
+
+
+class Replay:
+    """Everything seen, with the demonstrations (and relabelled successes) flagged.
+
+    Both stores of the paper are views of one: a sample comes from all episodes or from the flagged ones. Of an episode
+    that is not flagged, the steps that a person drove count as a demonstration all the same. The demonstrations of the
+    dataset come first and stay; behind them episodes go round in a ring, the oldest making room once the capacity is
+    used up.
+    """
+
+    def __init__(
+        self,
+        frame_stack: int,
+        n_step: int,
+        discount: float,
+        *,
+        folder: Path | None = None,
+        capacity_gib: float = 16.0,
+        by_step: bool = False,
+    ) -> None:
+        """An empty replay.
+
+        Args:
+            frame_stack: S >= 1 observations of history.
+            n_step: n >= 1.
+            discount: of a step, (0, 1].
+            folder: of its files, which survive a kill; None keeps everything in memory.
+            capacity_gib: GiB of all rows together, demonstrations included; > 0.
+            by_step: sample uniformly over time steps; else over episodes first, then over their steps.
+        """
+        self.frame_stack, self.n_step, self.discount = frame_stack, n_step, discount
+        self.folder, self.by_step = folder, by_step
+        self._capacity_bytes = int(capacity_gib * GIB)
+        self._rows: dict[str, Rows] = {}
+        self._places: list[Place] = []
+        self._fixed = 0  # episodes of the dataset
+        self._ring = 0  # first row behind them
+        self._head = 0  # where the next episode goes
+        self._reserved = 0
+        self._sampled: NDArray[Any] | None = None
+        self._buffers: dict[tuple[int, str], torch.Tensor] = {}
+        self._turn = 0
+        self._journal: Journal | None = None
+        if folder is not None:
+            self._journal = Journal(folder / "episodes.jsonl")
+
+    @property
+    def episodes(self) -> int:
+        """Episodes stored."""
+        return len(self._places)
+
+    @property
+    def demonstrations(self) -> int:
+        """Episodes flagged as demonstrations."""
+        return sum(place.demo for place in self._places)
+
+    @property
+    def steps(self) -> int:
+        """Time steps stored."""
+        return sum(place.length for place in self._places)
+
+    @property
+    def bytes_per_step(self) -> int:
+        """Bytes of a row: one uint8 frame a view, state, action and reward; 0 while it is empty."""
+        return sum(rows.row_bytes for rows in self._rows.values())
+
+    @property
+    def capacity(self) -> int:
+        """Rows that fit; an episode takes one more than it has steps."""
+        return self._capacity_bytes // max(1, self.bytes_per_step)
+
+    def add_demonstration(self, episode: Episode) -> None:
+        """Store an episode of the dataset, for good. Raises DataError as `add`; ConfigError when it does not fit."""
+        if self.episodes > self._fixed:
+            raise DataError("Demonstrations of the dataset come before the first episode of the run.")
+        arrays = self._checked(episode)
+        start, stop = self._ring, self._ring + len(episode) + 1
+        if stop > self.capacity:
+            raise ConfigError(
+                f"The demonstrations need more than --replay.capacity_gib={self._capacity_bytes / GIB:g}: raise it, or"
+                " make the pictures smaller (cqn-data resize)."
+            )
+        self._write(arrays, start, stop)
+        self._keep(Place(start, len(episode), episode.terminated, episode.success, episode.success))
+        self._fixed, self._ring, self._head = self.episodes, stop, stop
+
+    def add(self, episode: Episode, *, demo: bool, number: int = -1, note: dict[str, Any] | None = None) -> None:
+        """Store an episode of the run; the oldest ones make room.
+
+        number, note: kept with it on disk, for a resumed run.
+        Raises DataError when it is empty, not finite, or of another shape; ConfigError when it can never fit.
+        """
+        arrays = self._checked(episode)
+        start = self._head if self._head + len(episode) + 1 <= self.capacity else self._ring
+        place = Place(
+            start, len(episode), episode.terminated, episode.success, demo, number, note or {}, episode.taught
+        )
+        if place.stop > self.capacity:
+            raise ConfigError(
+                f"An episode of {len(episode)} steps does not fit behind the demonstrations: raise"
+                f" --replay.capacity_gib={self._capacity_bytes / GIB:g}."
+            )
+        if self._journal is not None and self.folder is not None:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if not (self.folder / "layout.json").is_file():
+                (self.folder / "layout.json").write_text(json.dumps(self._layout()))
+            self._journal.announce(place.start, place.stop)
+        self._evict(place.start, place.stop)
+        self._write(arrays, place.start, place.stop)
+        if self._journal is not None:
+            self._journal.complete(place)
+        self._keep(place)
+        self._head = place.stop
+
+    def relabel(self, number: int, *, success: bool, demo: bool) -> bool:
+        """Say otherwise how an episode of the run went: its last reward becomes 1 or 0, and it ends there either way.
+
+        Returns whether the episode is still here. demo: whether it counts as a demonstration from now on.
+        """
+        index = self._index(number)
+        if index is None:
+            return False
+        place = self._places[index]
+        place = replace(place, terminated=True, success=success, demo=demo, note={**place.note, "relabelled": True})
+        if self._journal is not None:
+            self._journal.complete(place)
+        self._label_reward(place)
+        self._places[index] = place
+        self._sampled = None
+        return True
+
+    def forget(self, number: int) -> bool:
+        """Never sample an episode of the run again; returns whether it was still here."""
+        index = self._index(number)
+        if index is None:
+            return False
+        place = self._places.pop(index)
+        if self._journal is not None:
+            self._journal.announce(place.start, place.stop)
+        self._sampled = None
+        return True
+
+    def sample(self, count: int, demo_count: int, rng: np.random.Generator) -> Batch:
+        """`count` transitions from everything followed by `demo_count` from the demonstrations.
+
+        Their pictures lie in memory that is used again: a batch is good until three more have been sampled.
+        Raises DataError when a store that is asked for is empty.
+        """
+        return self._assemble(*self._draw(count, demo_count, rng))
+
+    def batches(self, updates: int, count: int, demo_count: int, rng: np.random.Generator) -> Generator[Batch]:
+        """`updates` samples, the next one put together while one is in use; errors surface at the next one.
+
+        The same batches as from `sample`, and the same state of `rng` wherever the iteration ends.
+        """
+        with ThreadPoolExecutor(1) as pool:
+            ahead, before = None, rng.bit_generator.state
+            try:
+                for index in range(updates):
+                    batch = ahead.result() if ahead is not None else self.sample(count, demo_count, rng)
+                    before, ahead = rng.bit_generator.state, None
+                    if index + 1 < updates:
+                        ahead = pool.submit(self._assemble, *self._draw(count, demo_count, rng))
+                    yield batch
+            finally:
+                if ahead is not None:  # drawn, but not used
+                    rng.bit_generator.state = before
+
+    def _draw(self, count: int, demo_count: int, rng: np.random.Generator) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Episodes [B] and steps [B]."""
+        table = self._table()
+        everything, demos = np.arange(self.episodes), np.flatnonzero(table["demo"])
+        steps = table["last"] - table["first"]
+        if (count and not len(everything)) or (demo_count and not len(demos)):
+            raise DataError(
+                f"Cannot sample {count} + {demo_count}: the replay holds {len(everything)} episodes, of which "
+                f"{len(demos)} are demonstrations; give a dataset or set the batch size of the empty store to 0."
+            )
+        parts = []
+        for ids, size in ((everything, count), (demos, demo_count)):
+            weights = steps[ids] / steps[ids].sum() if self.by_step and size else None
+            parts += [rng.choice(ids, size, p=weights)] if size else []
+        episode = np.concatenate(parts)
+        return episode, rng.integers(table["first"][episode], table["last"][episode])
+
+    def _assemble(self, episode: NDArray[Any], step: NDArray[Any]) -> Batch:
+        """Transitions at the given steps [B] of the given episodes [B]."""
+        table = self._table()
+        start, length = table["start"][episode], table["length"][episode]
+        window = np.minimum(self.n_step, length - step)  # never past the end of the episode
+        offsets = np.arange(self.n_step)
+        inside = offsets < window[:, None]
+        rewards = self._rows["reward"].take((start + step)[:, None] + np.where(inside, offsets, 0)).numpy() * inside
+        reward = (rewards * self.discount**offsets).sum(-1, keepdims=True)
+        ended = (step + window == length) & table["terminated"][episode]
+        discount = np.where(ended, 0.0, self.discount**window)[:, None]
+        return Batch(
+            self._observation(start, step),
+            self._rows["action"].take(start + step),
+            torch.from_numpy(reward.astype(np.float32)),
+            torch.from_numpy(discount.astype(np.float32)),
+            self._observation(start, step + window),
+            torch.from_numpy(self._shown(episode, step)[:, None].astype(np.float32)),
+        )
+
+    def _shown(self, episode: NDArray[Any], step: NDArray[Any]) -> NDArray[Any]:
+        """Whether the steps [B] are of a demonstration, or driven by a person in an episode that is none."""
+        table = self._table()
+        shown: NDArray[Any] = table["demo"][episode]
+        for row in range(self.episodes, len(table)):
+            inside = (table["first"][row] <= step) & (step < table["last"][row])
+            shown = shown | (inside & (table["start"][episode] == table["start"][row]))
+        return shown
+
+    def _observation(self, start: NDArray[Any], step: NDArray[Any]) -> Observation:
+        """Stacked history that ends at `step`; before the first frame, the first frame is repeated."""
+        back = np.arange(self.frame_stack - 1, -1, -1)
+        rows = start[:, None] + np.maximum(step[:, None] - back, 0)  # [B, S]
+        low_dim = self._rows["low_dim"].take(rows)  # [B, S, P]
+        views = []
+        for name in (name for name in self._rows if name.startswith("view_")):
+            buffer = self._turn % (2 * BATCHES), name  # an observation and a next one for each batch
+            self._buffers[buffer] = self._rows[name].take(rows, self._buffers.get(buffer))
+            views.append(self._buffers[buffer].flatten(1, 2))
+        self._turn += 1
+        return Observation(tuple(views), low_dim.flatten(1) if low_dim.shape[-1] else None)
+
+    # -- rows and places -------------------------------------------------------------------------------------
+
+    def _checked(self, episode: Episode) -> dict[str, NDArray[Any]]:
+        """The arrays of an episode that fits; the first one decides shapes."""
+        if not len(episode):
+            raise DataError("An episode needs at least one step, got none.")
+        arrays = episode.arrays()
+        for name, what in (("low_dim", "state"), ("action", "action"), ("reward", "reward")):
+            if not np.isfinite(arrays[name]).all():
+                raise DataError(f"Episode {self.episodes} holds NaN or infinite values in its {what}.")
+        if not self._rows:
+            self._rows = {
+                name: Rows(self.folder / f"{name}.bin" if self.folder else None, values.shape[1:], values.dtype)
+                for name, values in arrays.items()
+            }
+        for name, values in arrays.items():
+            if name not in self._rows or values.shape[1:] != self._rows[name].shape:
+                held = self._rows[name].shape if name in self._rows else "none"
+                raise DataError(f"Rows of shape {values.shape[1:]} do not fit a replay of {held} ('{name}').")
+        return arrays
+
+    def _write(self, arrays: dict[str, NDArray[Any]], start: int, stop: int) -> None:
+        if stop > self._reserved:
+            self._reserved = min(self.capacity, max(1024, stop, 2 * self._reserved))
+            for rows in self._rows.values():
+                rows.reserve(self._reserved)
+        for name, values in arrays.items():
+            self._rows[name].write(start, values)
+
+    def _evict(self, start: int, stop: int) -> None:
+        """Forget the episodes of the run that lie in these rows."""
+        kept = [p for i, p in enumerate(self._places) if i < self._fixed or p.stop <= start or p.start >= stop]
+        if len(kept) < len(self._places):
+            self._places, self._sampled = kept, None
+
+    def _index(self, number: int) -> int | None:
+        """Where the run's episode of that number stands among the places."""
+        return next((i for i in range(self._fixed, self.episodes) if self._places[i].number == number), None)
+
+    def _label_reward(self, place: Place) -> None:
+        last = place.start + place.length - 1
+        self._rows["reward"].write(last, np.array([float(place.success)], np.float32))
+
+    def _keep(self, place: Place) -> None:
+        self._places.append(place)
+        self._sampled = None
+
+    def _table(self) -> NDArray[Any]:
+        """What is sampled: a row for each episode, and behind them one for each span that a person drove."""
+        if self._sampled is None:
+            rows = [(p.start, p.length, p.terminated, p.demo, 0, p.length) for p in self._places]
+            rows += [
+                (p.start, p.length, p.terminated, True, *span) for p in self._places if not p.demo for span in p.taught
+            ]
+            self._sampled = np.array(rows, dtype=SAMPLED)
+        return self._sampled
+
+    # -- after a kill ----------------------------------------------------------------------------------------
+
+    def _layout(self) -> dict[str, Any]:
+        """What must be the same when a run is resumed: rows of the demonstrations, capacity, shapes."""
+        shapes = {name: [*rows.shape, str(rows.dtype)] for name, rows in self._rows.items()}
+        return {"ring": self._ring, "capacity": self.capacity, "shapes": shapes}
+
+    def reopen(self) -> list[Place]:
+        """Take up the finished episodes of an earlier process; call once the demonstrations are in.
+
+        Returns all that are still there, oldest first. Raises DataError when the dataset or the settings changed, or
+        the files are damaged.
+        """
+        if self.folder is None or self._journal is None:
+            raise DataError("This replay has no folder to take episodes up from.")
+        layout = self.folder / "layout.json"
+        written = json.loads(layout.read_text()) if layout.is_file() else None
+        if self._rows and written is not None and written != self._layout():
+            raise DataError(
+                f"{self.folder} was laid out for another dataset or --replay.capacity_gib: resume with those that the"
+                " run began with, or start a new run."
+            )
+        self._journal.repair()
+        for (start, stop), place in self._journal.entries():
+            relabelled = place is not None and "relabelled" in place.note
+            index = self._index(place.number) if place is not None and relabelled else None
+            if place is not None and index is not None:
+                self._places[index] = place
+                continue
+            self._evict(start, stop)
+            if place is not None:
+                self._keep(place)
+                self._head = place.stop
+        if written is not None:
+            self._restore(written)
+        for place in self._places[self._fixed :]:
+            if "relabelled" in place.note:  # a kill may have come between the label and its reward
+                self._label_reward(place)
+        return self._places[self._fixed :]
+
+    def _restore(self, written: dict[str, Any]) -> None:
+        """Map the rows of the episodes that were taken up; without demonstrations their shapes come from the layout."""
+        assert self.folder is not None  # noqa: S101  # checked by the caller
+        if not self._rows:
+            for name, (*shape, dtype) in written["shapes"].items():
+                self._rows[name] = Rows(self.folder / f"{name}.bin", tuple(shape), dtype)
+        needed = max((p.stop for p in self._places), default=0)
+        for name, rows in self._rows.items():
+            path = self.folder / f"{name}.bin"
+            held = path.stat().st_size if path.is_file() else 0
+            if held < needed * rows.row_bytes:
+                raise DataError(f"{path} holds {held} bytes, expected {needed * rows.row_bytes}; it was cut off.")
+            rows.reserve(max(needed, self._reserved))
+        self._reserved = max(needed, self._reserved)

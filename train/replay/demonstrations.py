@@ -1,0 +1,138 @@
+"""Demonstrations of a LeRobotDataset as replay episodes: every column read once, every frame decoded once."""
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME
+from lerobot.utils.feature_utils import dataset_to_policy_features
+from numpy.typing import NDArray
+
+from lerobot_cqn.errors import DataError
+from lerobot_cqn.schema import NEXT_REWARD
+
+from ..agent import Agent
+from ..config import DatasetSettings
+from .buffer import Episode
+
+__all__ = ["load_episodes", "load_metadata"]
+
+logger = logging.getLogger(__name__)
+
+
+def load_metadata(settings: DatasetSettings) -> LeRobotDatasetMetadata:
+    """Features and statistics. Raises DataError when the dataset is missing, damaged or empty."""
+    root = Path(settings.root) if settings.root else HF_LEROBOT_HOME / settings.repo_id
+    if settings.root and not (root / "meta" / "info.json").is_file():
+        raise DataError(
+            f"No dataset at {root}: expected meta/info.json of a LeRobotDataset v3; check --dataset.root, "
+            "or make one with `cqn-data record`."
+        )
+    try:
+        meta = LeRobotDatasetMetadata(settings.repo_id, root=settings.root)
+    except Exception as error:
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        raise DataError(
+            f"No readable LeRobotDataset v3 '{settings.repo_id}' at {root}: give --dataset.root=DIR for a local one, "
+            f"or check --dataset.repo_id ({reason})."
+        ) from error
+    if not meta.total_episodes or not meta.total_frames:
+        raise DataError(f"The dataset at {root} is empty: expected at least one episode; record some first.")
+    chosen = range(meta.total_episodes) if settings.episodes is None else settings.episodes
+    if not chosen or min(chosen) < 0 or max(chosen) >= meta.total_episodes:
+        raise DataError(
+            f"--dataset.episodes={settings.episodes}: expected at least one of the episodes 0 to "
+            f"{meta.total_episodes - 1} that the dataset at {root} holds."
+        )
+    return meta
+
+
+def load_episodes(
+    settings: DatasetSettings, agent: Agent, on_episode: Callable[[int, int], None] = lambda _i, _n: None
+) -> list[Episode]:
+    """All demonstrations, in the policy's normalised units, cut after their first success.
+
+    Without a reward column the last step of each episode counts as the success (reward 1), and a line says so.
+    Datasets do not store what came after the last action: the last observation stands in for it.
+    Raises DataError for a missing feature, another size, or values that are not finite.
+    """
+    load_metadata(settings)
+    dataset = LeRobotDataset(settings.repo_id, root=settings.root, episodes=settings.episodes)
+    policy = agent.policy
+    missing = [key for key in (*policy.view_keys, *policy.low_dim_keys, ACTION) if key not in dataset.features]
+    if missing:
+        raise DataError(
+            f"The dataset has no '{missing[0]}', which the policy needs; it has {sorted(dataset.features)}."
+        )
+    found = dataset_to_policy_features(dataset.features)
+    for key, feature in {**(policy.config.input_features or {}), ACTION: policy.config.action_feature}.items():
+        if tuple(found[key].shape) != tuple(feature.shape):
+            raise DataError(
+                f"'{key}' has shape {tuple(found[key].shape)} in the dataset, but {tuple(feature.shape)} in the "
+                "policy: train a new policy, or give the dataset this one was trained on."
+            )
+    rewarded = NEXT_REWARD in dataset.features
+    columns = dataset.hf_dataset.with_format("numpy")
+    numbers = np.asarray(columns["episode_index"])
+    raw = {key: _column(columns, key) for key in (*policy.low_dim_keys, ACTION, *([NEXT_REWARD] if rewarded else []))}
+    _check_finite(raw, numbers)
+    if not rewarded:
+        logger.warning("No '%s' column: the last step of each episode counts as the success.", NEXT_REWARD)
+    vectors = {key: torch.from_numpy(value).float() for key, value in raw.items() if key != NEXT_REWARD}
+    if not policy.low_dim_keys:  # LeRobot's steps insist on an observation; pictures are decoded below
+        vectors[policy.view_keys[0]] = torch.zeros(1, 3, 1, 1)
+    prepared = agent.prepare(vectors)
+    low_dim, action = agent.low_dim(prepared), prepared[ACTION].cpu().numpy()
+    episodes = []
+    ids = np.unique(numbers)
+    for count, number in enumerate(ids):
+        rows = np.flatnonzero(numbers == number)
+        reward = raw[NEXT_REWARD][rows].reshape(-1) if rewarded else np.zeros(len(rows), np.float32)
+        if not rewarded:
+            reward[-1] = 1.0
+        success = bool((reward > 0).any())
+        if success:  # demonstrations end at the first success
+            rows = rows[: int(np.argmax(reward > 0)) + 1]
+        observed = np.append(rows, rows[-1])
+        pixels = tuple(view[np.append(np.arange(len(rows)), len(rows) - 1)] for view in _decode(dataset, agent, rows))
+        episodes.append(
+            Episode(
+                None if low_dim is None else low_dim[observed],
+                pixels,
+                action[rows].clip(-1, 1),
+                reward[: len(rows)].astype(np.float32),
+                success,
+                success,
+            )
+        )
+        on_episode(count + 1, len(ids))
+    return episodes
+
+
+def _column(columns: Any, key: str) -> NDArray[Any]:
+    return np.stack(columns[key]).astype(np.float32) if len(columns) else np.zeros((0, 1), np.float32)
+
+
+def _check_finite(raw: dict[str, NDArray[Any]], episodes: NDArray[Any]) -> None:
+    for key, values in raw.items():
+        bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
+        if len(bad):
+            frame = int(bad[0] - np.flatnonzero(episodes == episodes[bad[0]])[0])
+            raise DataError(
+                f"'{key}' is NaN or infinite in episode {int(episodes[bad[0]])}, frame {frame} "
+                f"({len(bad)} frames in all): expected finite numbers; drop or repair the episode."
+            )
+
+
+def _decode(dataset: LeRobotDataset, agent: Agent, rows: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    """Frames of each view, uint8 [T, 3, H, W]."""
+    if not agent.policy.view_keys:
+        return ()
+    items = [dataset[int(row)] for row in rows]
+    frame = {key: torch.stack([item[key] for item in items]) for key in agent.policy.view_keys}
+    return tuple(agent.pixels(frame))
