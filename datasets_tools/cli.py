@@ -16,8 +16,7 @@ from .terminal.console import Interrupted, explain, note, quiet, result
 
 __all__ = ["OPERATIONS", "main", "module_of"]
 
-# Operation -> one line for --help. Each lives in the module that MODULES names, else in that of its name in operations/,
-# and offers help() and main(args); an int that main returns is the exit code.
+# Operation -> one line for --help. Its module offers help() and main(args); an int that main returns is the exit code.
 OPERATIONS = {
     "convert": "turn RLBench, robomimic, ALOHA, diffusion_policy, NPZ or LeRobot v2.1 data into a LeRobotDataset v3",
     "inspect": "look at a dataset before training: pauses, cameras, outliers, what is missing",
