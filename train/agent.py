@@ -1,7 +1,7 @@
-"""A policy with its processors: frames of an environment in, commands and replay episodes out."""
+"""A policy with its processors: frames of an environment in, commands out."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,9 +20,8 @@ from lerobot_cqn.errors import DataError
 from lerobot_cqn.joint_goals import DeltaJoints, DeltaToGoalProcessorStep
 
 from .interfaces import Frame, Outcome
-from .replay.buffer import Episode
 
-__all__ = ["Agent", "Recorder"]
+__all__ = ["Agent"]
 
 
 @dataclass(frozen=True)
@@ -117,62 +116,6 @@ class Agent:
             found = sorted(key for key in frame if key.startswith("observation.image"))
             raise DataError(f"The policy needs the camera '{missing[0]}', the observation has {found or 'none'}.")
         return [_to_uint8(frame[key]) for key in self.policy.view_keys]
-
-
-@dataclass
-class Recorder:
-    """Collects one episode for the replay, in the policy's normalised units."""
-
-    agent: Agent
-    low_dim: list[NDArray[Any]] = field(default_factory=list)
-    pixels: list[list[NDArray[Any]]] = field(default_factory=list)
-    action: list[NDArray[Any]] = field(default_factory=list)
-    reward: list[float] = field(default_factory=list)
-    taught: list[bool] = field(default_factory=list)
-
-    def __len__(self) -> int:
-        """Steps so far."""
-        return len(self.action)
-
-    def observe(self, prepared: Frame) -> None:
-        """Keep a prepared frame."""
-        low_dim = self.agent.low_dim(prepared)
-        if low_dim is not None:
-            self.low_dim.append(low_dim)
-        self.pixels.append(self.agent.pixels(prepared))
-
-    def retake(self, prepared: Frame, reward: float) -> None:
-        """Keep a frame in place of the last one, and a reward for the step that led to it."""
-        if self.low_dim:
-            self.low_dim.pop()
-        self.pixels.pop()
-        self.observe(prepared)
-        if self.reward:
-            self.reward[-1] += reward
-
-    def step(self, action: torch.Tensor, reward: float, *, taught: bool = False) -> None:
-        """Keep what was done [1, D], what it earned, and whether a person did it."""
-        self.action.append(action[0].cpu().numpy())
-        self.reward.append(reward)
-        self.taught.append(taught)
-
-    def episode(self, *, terminated: bool, success: bool) -> Episode:
-        """The finished episode."""
-        return Episode(
-            np.concatenate(self.low_dim).astype(np.float32) if self.low_dim else None,
-            tuple(np.concatenate(view) for view in zip(*self.pixels, strict=True)) if self.pixels[0] else (),
-            np.stack(self.action).astype(np.float32),
-            np.asarray(self.reward, dtype=np.float32),
-            terminated,
-            success,
-            _spans(self.taught),
-        )
-
-
-def _spans(flags: list[bool]) -> tuple[tuple[int, int], ...]:
-    """Runs of True as (first, one past the last)."""
-    edges = np.flatnonzero(np.diff([0, *map(int, flags), 0])).tolist()
-    return tuple(zip(edges[::2], edges[1::2], strict=True))
 
 
 def _to_uint8(pixels: torch.Tensor) -> NDArray[Any]:

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cqn_train.bench.cli import load_plan, main, runs_of
+from cqn_train.bench.cli import main
+from cqn_train.bench.plan import load_plan, runs_of
 from cqn_train.bench.report import aggregate
 from lerobot_cqn.errors import ConfigError
 

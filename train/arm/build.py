@@ -21,7 +21,6 @@ from lerobot_cqn.errors import ConfigError, DataError, one_of
 
 from ..agent import Agent
 from ..config import DatasetSettings, RunConfig
-from ..demo.stages import read_rows
 from ..interfaces import PAGE_TOKEN
 from ..operator.board import Board
 from ..operator.session import Session
@@ -30,6 +29,7 @@ from ..robot.arm import Arm, state_names
 from ..robot.guard import Guard, GuardSettings
 from ..robot.limits import Forward, Limits
 from ..robot.settings import ArmSettings
+from ..run.metrics import read_rows
 from .environment import ArmEnvironment
 
 __all__ = ["Operated", "make_operated", "recall", "steering"]

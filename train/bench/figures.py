@@ -3,13 +3,12 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from .cli import Plan
+from .plan import Plan
 
 __all__ = ["Curve", "draw_aggregate", "draw_curves", "draw_table", "spread"]
 
@@ -41,7 +40,7 @@ def spread(values: NDArray[np.float64]) -> Any:
     return values.std(axis=0, ddof=1) if len(values) > 1 else np.zeros(values.shape[1:])
 
 
-def draw_aggregate(iqm: Mapping[str, tuple[float, float, float]], plan: "Plan", seeds: int, path: Path) -> None:
+def draw_aggregate(iqm: Mapping[str, tuple[float, float, float]], plan: Plan, seeds: int, path: Path) -> None:
     """Interquartile mean of each method as a line in its 95 % interval."""
     from matplotlib.figure import Figure
 
@@ -62,7 +61,7 @@ def draw_aggregate(iqm: Mapping[str, tuple[float, float, float]], plan: "Plan", 
     figure.savefig(path, dpi=130)
 
 
-def draw_table(scores: Mapping[str, NDArray[np.float64]], plan: "Plan", seeds: int, path: Path) -> None:
+def draw_table(scores: Mapping[str, NDArray[np.float64]], plan: Plan, seeds: int, path: Path) -> None:
     """Methods by tasks, mean ± standard deviation over seeds, the shade following the mean; last, the mean of tasks."""
     from matplotlib.figure import Figure
 
@@ -90,7 +89,7 @@ def draw_table(scores: Mapping[str, NDArray[np.float64]], plan: "Plan", seeds: i
     figure.savefig(path, dpi=130)
 
 
-def draw_curves(curves: Sequence[Curve], plan: "Plan", path: Path) -> None:
+def draw_curves(curves: Sequence[Curve], plan: Plan, path: Path) -> None:
     """Mean over seeds with the range from the lowest to the highest one, one panel a task."""
     from matplotlib.figure import Figure
 
@@ -120,5 +119,5 @@ def draw_curves(curves: Sequence[Curve], plan: "Plan", path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def _name(plan: "Plan") -> str:
+def _name(plan: Plan) -> str:
     return plan.score.replace("_", " ")

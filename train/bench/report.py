@@ -3,7 +3,7 @@
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,7 @@ from rich.console import Console
 from lerobot_cqn.errors import ConfigError, DataError
 
 from .figures import Curve, draw_aggregate, draw_curves, draw_table, spread
-
-if TYPE_CHECKING:
-    from .cli import Plan, Run
+from .plan import Plan, Run
 
 __all__ = ["Aggregate", "aggregate", "check_packages", "write_report"]
 
@@ -61,7 +59,7 @@ def aggregate(scores: Scores) -> tuple[Aggregate, Aggregate]:
     return iqm, {o: (float(better[o]), float(spread[o][0, 0]), float(spread[o][1, 0])) for o in others}
 
 
-def write_report(plan: "Plan", runs: Sequence["Run"], folder: Path, console: Console) -> None:
+def write_report(plan: Plan, runs: Sequence[Run], folder: Path, console: Console) -> None:
     """Write results.csv, results.md, curves.csv and the pictures of both into `folder`, and print the table.
 
     Methods are compared over the seeds that all of them have finished on all tasks; DataError where there is none.
@@ -98,7 +96,7 @@ def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, A
 
 
 def _markdown(
-    plan: "Plan", scores: Scores, iqm: Aggregate, better: Aggregate, seeds: Sequence[int], final: Mapping[Any, Any]
+    plan: Plan, scores: Scores, iqm: Aggregate, better: Aggregate, seeds: Sequence[int], final: Mapping[Any, Any]
 ) -> str:
     n = {row["n"] for row in final.values()}
     digits = plan.digits
@@ -127,7 +125,7 @@ def _markdown(
     return "\n".join(lines) + "\n"
 
 
-def _curve(plan: "Plan", runs: Sequence["Run"], task: str, method: str) -> Curve | None:
+def _curve(plan: Plan, runs: Sequence[Run], task: str, method: str) -> Curve | None:
     """Over seeds, evaluation by evaluation: they lie at ends of episodes, so their steps differ a little.
 
     None where no run is done. Where runs differ in their number of evaluations, the last ones before the end are left

@@ -9,7 +9,6 @@ import os
 import secrets
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,28 +17,15 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from ..interfaces import PAGE_TOKEN
-from .stages import Stages, fresh, read_rows, run_once
+from ..run.metrics import read_rows
+from .config import ArmDemoConfig
+from .stages import Stages, fresh, run_once
 
-__all__ = ["ArmDemoConfig", "main", "run_demo"]
+__all__ = ["main", "run_demo"]
 
 CLOCK = 4  # simulated seconds in a real one
 RATE = 10  # control steps in a simulated second
 LOG_EVERY_S = 30.0
-
-
-@dataclass(frozen=True)
-class ArmDemoConfig:
-    """Size of the demo; the defaults fit 2 CPU cores and 10 minutes."""
-
-    output_dir: Path = Path("outputs/demo-arm")
-    demonstrations: int = 20
-    offline_updates: int = 60
-    steps: int = 1800
-    helped_episodes: int = 15  # in which the simulated person takes over where a try takes long
-    eval_episodes: int = 40
-    episode_s: float = 6.5  # simulated
-    port: int = 8765
-    seed: int = 0
 
 
 def run_demo(config: ArmDemoConfig, console: Console) -> dict[str, Any]:

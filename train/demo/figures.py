@@ -1,4 +1,4 @@
-"""Pictures of a run, as PNG bytes; matplotlib is imported on use (extra `report`)."""
+"""Pictures of the demos' reports, as PNG bytes."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lerobot_cqn.errors import ConfigError
+from ..run.curve import png, pyplot
 
-__all__ = ["animation", "arm_session", "curves", "dropped_steps", "film_strip", "learning_curve", "poster"]
+__all__ = ["animation", "arm_session", "curves", "dropped_steps", "film_strip", "poster"]
 
 COLOURS = {"filtered": "#1f77b4", "unfiltered": "#d95f02"}
 KEPT, DROPPED = "#1f77b4", "#d9d9d9"
@@ -18,28 +18,9 @@ KEPT, DROPPED = "#1f77b4", "#d9d9d9"
 Rows = Sequence[Mapping[str, str]]
 
 
-def _pyplot() -> Any:
-    try:
-        import matplotlib as mpl
-    except ImportError as error:
-        raise ConfigError("Reports need the extra: pip install 'lerobot_policy_cqn[report]'.") from error
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    plt.rcParams.update({"font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "figure.dpi": 120})
-    return plt
-
-
-def _png(figure: Any) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", bbox_inches="tight")
-    _pyplot().close(figure)
-    return buffer.getvalue()
-
-
 def curves(evaluations: Mapping[str, Rows], labels: Mapping[str, str], expert: float) -> bytes:
     """Success rate over environment steps with its 95 % interval, one line per variant."""
-    figure, axes = _pyplot().subplots(figsize=(7.2, 3.4))
+    figure, axes = pyplot().subplots(figsize=(7.2, 3.4))
     for name, rows in evaluations.items():
         steps = [int(row["env_steps"]) for row in rows]
         rate = [float(row["success_rate"]) for row in rows]
@@ -49,14 +30,14 @@ def curves(evaluations: Mapping[str, Rows], labels: Mapping[str, str], expert: f
     axes.axhline(expert, color="0.5", linestyle=":", linewidth=1, label="scripted expert")
     axes.set(xlabel="environment steps (0 is after offline training)", ylabel="success rate", ylim=(-0.03, 1.04))
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(evaluations) + 1, frameon=False)
-    return _png(figure)
+    return png(figure)
 
 
 def arm_session(episodes: Rows, evaluations: Rows) -> bytes:
     """A session on an arm: success of every episode and its running mean of 5 (the paper's measure), the share of each
     that a person drove, and evaluations before and after.
     """
-    figure, axes = _pyplot().subplots(figsize=(7.2, 3.2))
+    figure, axes = pyplot().subplots(figsize=(7.2, 3.2))
     success = np.array([float(row["success"]) for row in episodes])
     driven = np.array([int(row["taught"]) / int(row["length"]) for row in episodes])
     number = np.arange(1, len(success) + 1)
@@ -72,30 +53,12 @@ def arm_session(episodes: Rows, evaluations: Rows) -> bytes:
     axes.errorbar(place, rate, yerr=spread, fmt="D", color="black", markersize=5, capsize=3, label=text)
     axes.set(xlabel="episodes online", ylabel="success, share of steps", ylim=(-0.05, 1.07))
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False, fontsize=8)
-    return _png(figure)
-
-
-def learning_curve(episodes: Rows, evaluations: Rows) -> bytes:
-    """A run: evaluations with their 95 % intervals, and the running mean of 10 training episodes."""
-    figure, axes = _pyplot().subplots(figsize=(7.2, 3.2))
-    if episodes:
-        success = np.array([float(row["success"]) for row in episodes])
-        mean = [success[max(0, i - 9) : i + 1].mean() for i in range(len(success))]
-        text = "training episodes, running mean of 10"
-        axes.plot([int(row["env_steps"]) for row in episodes], mean, color="0.7", linewidth=1, label=text)
-    steps, rate = [int(row["env_steps"]) for row in evaluations], [float(row["success_rate"]) for row in evaluations]
-    low, high = [float(row["ci_low"]) for row in evaluations], [float(row["ci_high"]) for row in evaluations]
-    axes.plot(steps, rate, marker="o", markersize=4, color=KEPT, label="evaluation, with its 95 % interval")
-    spread = [np.subtract(rate, low), np.subtract(high, rate)]
-    axes.errorbar(steps, rate, yerr=spread, fmt="none", ecolor=KEPT, alpha=0.5, capsize=3)
-    axes.set(xlabel="control steps online (0 is after offline training)", ylabel="success rate", ylim=(-0.03, 1.04))
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False, fontsize=9)
-    return _png(figure)
+    return png(figure)
 
 
 def dropped_steps(episodes: Sequence[Mapping[str, Any]]) -> bytes:
     """What the filter dropped: one bar per episode along its time steps, pauses in grey."""
-    plt = _pyplot()
+    plt = pyplot()
     figure, axes = plt.subplots(figsize=(7.2, 0.11 * len(episodes) + 0.9))
     for row, episode in enumerate(episodes):
         axes.barh(row, episode["steps"], color=KEPT, height=0.72)
@@ -108,7 +71,7 @@ def dropped_steps(episodes: Sequence[Mapping[str, Any]]) -> bytes:
         handles, ["kept", "dropped: pause"], loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False
     )
     axes.margins(y=0.01)
-    return _png(figure)
+    return png(figure)
 
 
 def film_strip(frames: Sequence[NDArray[Any]], count: int = 6, width: int = 220) -> bytes:
@@ -123,7 +86,7 @@ def film_strip(frames: Sequence[NDArray[Any]], count: int = 6, width: int = 220)
 
 def poster(curves_png: bytes, films: Mapping[str, Sequence[NDArray[Any]]], width: int = 1200) -> bytes:
     """One picture for the README: film strips with captions, and the learning curves."""
-    plt = _pyplot()
+    plt = pyplot()
     strips = {name: np.asarray(Image.open(io.BytesIO(film_strip(frames, 8, 160)))) for name, frames in films.items()}
     chart = np.asarray(Image.open(io.BytesIO(curves_png)).convert("RGB"))
     heights = [picture.shape[0] / picture.shape[1] + 0.035 for picture in strips.values()]
@@ -136,7 +99,7 @@ def poster(curves_png: bytes, films: Mapping[str, Sequence[NDArray[Any]]], width
     for axes in rows:
         axes.axis("off")
     figure.subplots_adjust(left=0.01, right=0.99, top=0.97, bottom=0.0, hspace=0.16)
-    return _png(figure)
+    return png(figure)
 
 
 def animation(frames: Sequence[NDArray[Any]], fps: int, width: int = 320, hold_s: float = 1.2) -> bytes:

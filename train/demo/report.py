@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -22,18 +22,16 @@ from ..agent import Agent
 from ..envs.ur5e_station.config import UR5eStationEnv
 from ..loop.evaluate import EVAL_SEED, Evaluation, evaluate, wilson_interval
 from ..loop.gym_env import GymEnvironment, OneScene
+from ..run.metrics import read_rows
 from . import figures
-from .stages import read_rows
-
-if TYPE_CHECKING:
-    from .station import DemoConfig
+from .config import DemoConfig
 
 __all__ = ["write_report"]
 
 Frames = list[NDArray[Any]]
 
 
-def write_report(config: "DemoConfig", labels: Mapping[str, str], wall_s: float) -> dict[str, Any]:
+def write_report(config: DemoConfig, labels: Mapping[str, str], wall_s: float) -> dict[str, Any]:
     """Write report.html and summary.json into `config.output_dir`; returns the summary."""
     out = config.output_dir
     dropped = json.loads((out / "dropped.json").read_text())[0]  # the first step of the recipe

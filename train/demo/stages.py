@@ -1,6 +1,5 @@
 """Commands one after the other, each with its output in a log; what is done is not done again."""
 
-import csv
 import json
 import os
 import subprocess
@@ -17,7 +16,7 @@ from rich.console import Console
 from cqn_data.terminal.console import explain
 from lerobot_cqn.errors import CQNError
 
-__all__ = ["DemoError", "Stages", "fresh", "read_rows", "run_once"]
+__all__ = ["DemoError", "Stages", "fresh", "run_once"]
 
 
 class DemoError(CQNError):
@@ -89,14 +88,6 @@ def fresh(run: Path) -> Path:
     if run.exists():
         run.rename(run.with_name(f"{run.name}-unfinished-{int(time.time())}"))
     return run
-
-
-def read_rows(path: Path) -> list[dict[str, str]]:
-    """Rows of a CSV table; none while it does not exist."""
-    if not path.exists():
-        return []
-    with path.open() as file:
-        return list(csv.DictReader(file))
 
 
 def run_once(

@@ -7,7 +7,6 @@ Interrupted at any moment, it continues where it was when started again.
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,29 +14,15 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from .stages import Stages, fresh, read_rows, run_once
+from ..run.metrics import read_rows
+from .config import DemoConfig
+from .stages import Stages, fresh, run_once
 
-__all__ = ["DemoConfig", "main", "run_demo"]
+__all__ = ["main", "run_demo"]
 
 LOG_EVERY_S = 30.0  # between lines where there is no terminal for a bar
 VARIANTS = {"filtered": "pauses dropped", "unfiltered": "pauses kept"}
 ENV = ("--env.type=ur5e_station", "--env.task=click_button")
-
-
-@dataclass(frozen=True)
-class DemoConfig:
-    """Size of the demo; the defaults fit 2 CPU cores and 10 minutes."""
-
-    output_dir: Path = Path("outputs/demo")
-    demonstrations: int = 30
-    pause_share: float = 0.45
-    seed: int = 0
-    offline_updates: int = 150
-    steps: int = 2400
-    eval_freq: int = 400
-    eval_episodes: int = 20
-    final_episodes: int = 50
-    expert_episodes: int = 50
 
 
 def run_demo(config: DemoConfig, console: Console) -> dict[str, Any]:

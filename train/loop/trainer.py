@@ -12,11 +12,12 @@ import numpy as np
 from lerobot_cqn.learner import Learner, NonFiniteLossError
 from lerobot_cqn.schema import Batch
 
-from ..agent import Agent, Recorder
+from ..agent import Agent
 from ..config import RunConfig
 from ..interfaces import Environment, Interrupted, Label, Outcome, Person, Scenes
 from ..replay.buffer import Episode, Replay
 from ..replay.files import Place
+from ..replay.recorder import Recorder
 from ..run.checkpoint import Counters
 from ..run.first_look import save_batch, write_films
 from ..run.metrics import Metrics

@@ -25,9 +25,8 @@ from lerobot_cqn.model_card import DataFacts, Evaluated, ModelFacts, action_kind
 
 from ..agent import Agent
 from ..config import DatasetSettings
-from ..demo.stages import read_rows
 from ..replay.demonstrations import load_metadata
-from ..run.metrics import COLUMNS
+from ..run.metrics import COLUMNS, read_rows
 
 __all__ = ["Found", "find_checkpoint", "look"]
 
@@ -212,7 +211,7 @@ def _results(found: Found, films: int, files: dict[str, Content]) -> tuple[list[
 def _draw(found: Found, rows: list[dict[str, str]], files: dict[str, Content]) -> None:
     if not rows or found.run is None:
         return
-    from ..demo.figures import learning_curve
+    from ..run.curve import learning_curve
 
     try:
         files[CURVE] = learning_curve(read_rows(found.run / "episodes.csv"), rows)

@@ -7,7 +7,7 @@ from typing import Any
 
 from lerobot_cqn.errors import ConfigError
 
-__all__ = ["COLUMNS", "Log", "Metrics", "start_tensorboard", "start_wandb"]
+__all__ = ["COLUMNS", "Log", "Metrics", "read_rows", "start_tensorboard", "start_wandb"]
 
 Log = Callable[[Mapping[str, float]], Any]
 
@@ -58,6 +58,14 @@ class Metrics:
         for table, size in sizes.items():
             with (self.output_dir / f"{table}.csv").open("r+b") as file:
                 file.truncate(size)
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Rows of a table that `Metrics` wrote, as text by column; none while it does not exist."""
+    if not path.exists():
+        return []
+    with path.open() as file:
+        return list(csv.DictReader(file))
 
 
 def _text(value: Any) -> Any:

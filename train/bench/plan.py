@@ -1,0 +1,127 @@
+"""A plan of `cqn-bench` and its runs, each a process of `cqn-train` that is judged by what it leaves on disk."""
+
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lerobot_cqn.errors import ConfigError, one_of
+
+from ..run.metrics import read_rows
+
+__all__ = ["Plan", "Run", "load_plan", "runs_of"]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to run: arguments of `cqn-train` by method and by task, seeds, and what all have in common."""
+
+    methods: Mapping[str, Sequence[str]]
+    tasks: Mapping[str, Sequence[str]]
+    seeds: Sequence[int]
+    common: Sequence[str] = ()
+    score: str = "success_rate"
+
+    @property
+    def digits(self) -> int:
+        """Decimals of a score in tables."""
+        return 2 if self.score == "success_rate" else 0
+
+
+@dataclass
+class Run:
+    """One training run and how far it is."""
+
+    task: str
+    method: str
+    seed: int
+    folder: Path
+    arguments: list[str]
+    state: str = "waiting"
+    process: "subprocess.Popen[bytes] | None" = field(default=None, repr=False)
+
+    def rows(self) -> list[dict[str, str]]:
+        """Its evaluations so far."""
+        return read_rows(self.folder / "evaluations.csv")
+
+    def last_words(self) -> str:
+        """Last line of its log, and where it is."""
+        path = self.folder.with_suffix(".log")
+        lines = path.read_text(errors="replace").split("\n") if path.is_file() else []
+        said = next((line.strip() for line in reversed(lines) if line.strip()), "")
+        return f"{said} (log: {path})" if said else f"see {path}"
+
+    @property
+    def done(self) -> bool:
+        """Whether it has its final evaluation."""
+        return any(row["phase"] == "final" for row in self.rows())
+
+    def start(self) -> None:
+        """Begin, or continue from its last checkpoint; what it prints goes to a log beside its folder."""
+        resumes = (self.folder / "checkpoints" / "last").exists()
+        target = [f"--output_dir={self.folder}"]
+        arguments = ["--resume=true", *target] if resumes else [*self.arguments, *target]
+        self.folder.parent.mkdir(parents=True, exist_ok=True)
+        with self.folder.with_suffix(".log").open("ab") as log:
+            command = [sys.executable, "-m", "cqn_train.cli", *arguments]
+            self.process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
+        self.state = "running"
+
+    def look(self) -> None:
+        """Notice that it has ended."""
+        if self.process is None or self.process.poll() is None:
+            return
+        code = self.process.returncode
+        self.state = "done" if code == 0 and self.done else "stopped" if code == 130 else "failed"
+        self.process = None
+
+
+def load_plan(path: Path) -> Plan:
+    """Read a plan. Raises ConfigError when it is not there or not of the form that `HELP` shows."""
+    if not path.is_file():
+        raise ConfigError(f"No plan at {path}: give a YAML file, as cqn-bench --help shows.")
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    keys = ("common", "methods", "tasks", "seeds", "score")
+    if not isinstance(content, Mapping):
+        raise ConfigError(f"{path}: expected the keys {', '.join(keys)}.")
+    for key in content:
+        if key not in keys:
+            raise ConfigError(f"{path}: " + one_of("key", str(key), keys))
+    plan = Plan(content.get("methods") or {}, content.get("tasks") or {}, content.get("seeds") or [],
+                content.get("common") or [], content.get("score", "success_rate"))  # fmt: skip
+    for name in ("methods", "tasks"):
+        table: Any = getattr(plan, name)
+        if not isinstance(table, Mapping) or not table or not all(_flags(flags) for flags in table.values()):
+            raise ConfigError(f"{path}: expected {name} as NAME: [--flag=value, …], at least one.")
+        for entry in table:
+            if not str(entry).replace("_", "").replace("-", "").replace(".", "").isalnum():
+                raise ConfigError(f"{path}: '{entry}' becomes a folder: expected letters, digits, '_', '-' and '.'.")
+    if not _flags(plan.common):
+        raise ConfigError(f"{path}: expected common as a list of --flag=value.")
+    if plan.score not in (valid := ("success_rate", "mean_return")):
+        raise ConfigError(f"{path}: " + one_of("score", str(plan.score), valid))
+    if not plan.seeds or not all(isinstance(seed, int) and seed >= 0 for seed in plan.seeds):
+        raise ConfigError(f"{path}: expected seeds as a list of whole numbers, got {plan.seeds}.")
+    return plan
+
+
+def runs_of(plan: Plan, folder: Path) -> list[Run]:
+    """All runs, seeds first, so that every method has a first result early."""
+    runs = []
+    for seed in plan.seeds:
+        for task, of_task in plan.tasks.items():
+            for method, of_method in plan.methods.items():
+                arguments = [*plan.common, *of_method, *of_task, f"--seed={seed}"]
+                runs.append(Run(task, method, seed, folder / task / method / str(seed), arguments))
+    return runs
+
+
+def _flags(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(v, str) and v.startswith("--") for v in value)
