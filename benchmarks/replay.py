@@ -71,7 +71,12 @@ def make_episode(rng: np.random.Generator, steps: int, views: int, side: int) ->
     pictures = tuple(rng.integers(0, 256, (steps + 1, 3, side, side), np.uint8) for _ in range(views))
     state, action = rng.normal(size=(steps + 1, 7)), rng.uniform(-1, 1, (steps, 7))
     return Episode(
-        state.astype(np.float32), pictures, action.astype(np.float32), np.zeros(steps, np.float32), False, True
+        low_dim=state.astype(np.float32),
+        pixels=pictures,
+        action=action.astype(np.float32),
+        reward=np.zeros(steps, np.float32),
+        terminated=False,
+        success=True,
     )
 
 

@@ -94,7 +94,14 @@ def random_batch(settings: CQNSettings, views: int, size: int) -> Batch:
         return Observation(pixels, torch.randn(size, LOW_DIM * settings.frame_stack))
 
     reward, demo = (torch.rand(size, 1) < 0.05).float(), (torch.arange(size) % 2 == 0).float()[:, None]
-    return Batch(observation(), 2 * torch.rand(size, DIMS) - 1, reward, 0.97 * (1 - reward), observation(), demo)
+    return Batch(
+        observation=observation(),
+        action=2 * torch.rand(size, DIMS) - 1,
+        reward=reward,
+        discount=0.97 * (1 - reward),
+        next_observation=observation(),
+        demo=demo,
+    )
 
 
 def parse() -> argparse.Namespace:

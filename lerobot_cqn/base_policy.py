@@ -155,7 +155,14 @@ class RLPolicy(PreTrainedPolicy):
         action = batch[ACTION].flatten(1, -2) if batch[ACTION].ndim == 2 else batch[ACTION][:, 0]
         demo = torch.ones_like(action[:, :1])
         if s.rl_loss_scale == 0:  # imitation only: rewards and next observations are not read
-            return Batch(observation, action, demo * 0, demo * 0, observation, demo)
+            return Batch(
+                observation=observation,
+                action=action,
+                reward=demo * 0,
+                discount=demo * 0,
+                next_observation=observation,
+                demo=demo,
+            )
         reward, discount, window = self._n_step(batch, action)
         # The stack that ends where the window does. An offset that was not loaded lies at the episode's end, where
         # the last one, repeated, is the same frame.
@@ -163,7 +170,14 @@ class RLPolicy(PreTrainedPolicy):
         row = torch.arange(len(action), device=action.device)[:, None]
         later = torch.tensor(loaded, device=action.device)[window + torch.arange(s.frame_stack, device=action.device)]
         next_observation = self.stack({key: value[row, later] for key, value in frames.items()})
-        return Batch(observation, action, reward, discount, next_observation, demo)
+        return Batch(
+            observation=observation,
+            action=action,
+            reward=reward,
+            discount=discount,
+            next_observation=next_observation,
+            demo=demo,
+        )
 
     def _n_step(self, batch: dict[str, Tensor], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Discounted reward sum, bootstrap discount and length of the window in steps, all [B, 1]."""

@@ -64,7 +64,7 @@ class Observation:
         return type(self)(tuple(view.to(device, non_blocking=True) for view in self.pixels), low_dim)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Batch:
     """n-step transitions.
 
@@ -84,12 +84,12 @@ class Batch:
     def to(self, device: torch.device | str) -> Self:
         """Return the same batch on `device`."""
         return type(self)(
-            self.observation.to(device),
-            self.action.to(device, non_blocking=True),
-            self.reward.to(device, non_blocking=True),
-            self.discount.to(device, non_blocking=True),
-            self.next_observation.to(device),
-            self.demo.to(device, non_blocking=True),
+            observation=self.observation.to(device),
+            action=self.action.to(device, non_blocking=True),
+            reward=self.reward.to(device, non_blocking=True),
+            discount=self.discount.to(device, non_blocking=True),
+            next_observation=self.next_observation.to(device),
+            demo=self.demo.to(device, non_blocking=True),
         )
 
 

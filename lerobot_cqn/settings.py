@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from .errors import ConfigError, one_of
+from .ranges import check_ranges, number
 
 __all__ = ["DRQV2_PRESETS", "PRESETS", "CQNSettings", "CommonSettings", "DrQv2Settings", "resolve"]
 
@@ -18,47 +19,41 @@ class CommonSettings:
     """
 
     # Observation
-    frame_stack: int = 8  # S; joints and environment state are stacked like the images
-    shift_pixels: int = 4  # random shift, 0 is off
-    brightness: float = 0.0  # factor drawn from 1 +- this
-    contrast: float = 0.0  # likewise, around the picture's mean
+    frame_stack: int = number(8, least=1)  # S; joints and environment state are stacked like the images
+    shift_pixels: int = number(4, least=0)  # random shift, 0 is off
+    brightness: float = number(0.0, least=0)  # factor drawn from 1 +- this
+    contrast: float = number(0.0, least=0)  # likewise, around the picture's mean
     state_bound: float = 2.0  # normalised state is cut here: demonstrations span [-1, 1]
     # Action
-    action_margin: float = 0.0  # widens the action bounds by this share of the range, on each side
+    action_margin: float = number(0.0, least=0)  # widens the action bounds by this share of the range, on each side
     # Networks
     encoder_channels: tuple[int, ...] = (32, 64, 128, 256)  # of each convolution, stride 2; one encoder a camera
-    feature_dim: int = 64  # size of the projections of pictures and of numbers, before the trunk
-    hidden_dim: int = 512  # width of the trunk
+    feature_dim: int = number(64, least=1)  # size of the projections of pictures and of numbers, before the trunk
+    hidden_dim: int = number(512, least=1)  # width of the trunk
     # Value distribution
     distributional: bool = True  # False: scalar Q and squared error
-    atoms: int = 51  # A, atoms of the value distribution
+    atoms: int = number(51, least=2)  # A, atoms of the value distribution
     v_min: float = -1.0  # lowest value that the distribution can hold
     v_max: float = 1.0  # highest value that the distribution can hold
     # Losses
-    rl_loss_scale: float = 0.1  # 0 leaves imitation alone
-    bc_loss_scale: float = 1.0  # weight of the imitation losses; 0 leaves RL alone
-    discount: float = 0.99  # the authors' implementation; the paper gives no number
-    n_step: int = 3  # n, steps of reward before the value of what follows
+    rl_loss_scale: float = number(0.1, least=0)  # 0 leaves imitation alone
+    bc_loss_scale: float = number(1.0, least=0)  # weight of the imitation losses; 0 leaves RL alone
+    discount: float = number(0.99, above=0, most=1)  # the authors' implementation; the paper gives no number
+    n_step: int = number(3, least=1)  # n, steps of reward before the value of what follows
     # Optimisation
-    lr: float = 5e-5  # learning rate of AdamW
-    weight_decay: float = 0.1  # of AdamW
-    tau: float = 0.02  # share by which the target network follows in each update
+    lr: float = number(5e-5, above=0)  # learning rate of AdamW
+    weight_decay: float = number(0.1, least=0)  # of AdamW
+    tau: float = number(0.02, above=0, most=1)  # share by which the target network follows in each update
     # Acting
-    exploration_noise: float = 0.01  # standard deviation of the noise on actions in [-1, 1], in training episodes only
+    # standard deviation of the noise on actions in [-1, 1], in training episodes only
+    exploration_noise: float = number(0.01, least=0)
     # Speed
     channels_last: bool = True  # memory layout of pictures; the same numbers, faster convolutions
     bf16: bool = False  # networks in bfloat16, losses in float32
 
     def __post_init__(self) -> None:
         """Check ranges; every message names the field, the value found and what is allowed."""
-        for name, low in self.lowest().items():
-            if not getattr(self, name) >= low:  # so that NaN is refused
-                raise ConfigError(f"`{name}` must be at least {low}, got {getattr(self, name)}.")
-        for name in ("tau", "discount"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ConfigError(f"`{name}` must be in (0, 1], got {getattr(self, name)}.")
-        if not self.lr > 0:
-            raise ConfigError(f"`lr` must be positive, got {self.lr}.")
+        check_ranges(self)
         if not self.state_bound >= 1:
             raise ConfigError(
                 f"`state_bound` must be at least 1 (demonstrations span [-1, 1]), got {self.state_bound}."
@@ -69,14 +64,6 @@ class CommonSettings:
             raise ConfigError(f"`encoder_channels` must be positive numbers, got {self.encoder_channels}.")
         if self.rl_loss_scale == 0 and self.bc_loss_scale == 0:
             raise ConfigError("Nothing to learn: `rl_loss_scale` and `bc_loss_scale` are both 0; set one above 0.")
-
-    def lowest(self) -> dict[str, float]:
-        """The least value of each number that has one."""
-        return {
-            "frame_stack": 1, "atoms": 2, "n_step": 1, "feature_dim": 1, "hidden_dim": 1, "shift_pixels": 0,
-            "brightness": 0, "contrast": 0, "action_margin": 0, "rl_loss_scale": 0, "bc_loss_scale": 0,
-            "exploration_noise": 0, "weight_decay": 0,
-        }  # fmt: skip
 
     @property
     def critic_atoms(self) -> int:
@@ -89,16 +76,17 @@ class CQNSettings(CommonSettings):
     """Hyperparameters of CQN. Raises ConfigError when a value is out of its range."""
 
     # Discretisation
-    levels: int = 3  # L, levels of zooming in
-    bins: int = 5  # N, bins of each level
+    levels: int = number(3, least=1)  # L, levels of zooming in
+    bins: int = number(5, least=2)  # N, bins of each level
     # Losses; rl_loss_scale=0 gives the paper's CBC baseline, distributional=False also margin-only imitation
     bc_dominance: bool = True  # False: margin only
-    bc_margin: float = 0.01  # the authors' implementation; the paper gives no number
+    bc_margin: float = number(0.01, least=0)  # the authors' implementation; the paper gives no number
     centralized_critic: bool = False  # True: one value for the whole action, the mean over D (an ablation of the paper)
     next_action_from: str = "online"  # the authors' double-Q style; "target" is equation 2 as written
     # Acting
     act_with: str = "target"  # critic that acts: the target or the online one
-    random_bin_below: float = 1e-4  # exploring only: a spread of Q under this picks a random bin; 0 is off
+    # exploring only: a spread of Q under this picks a random bin; 0 is off
+    random_bin_below: float = number(1e-4, least=0)
 
     def __post_init__(self) -> None:
         """Check ranges, and the two choices of a critic."""
@@ -106,10 +94,6 @@ class CQNSettings(CommonSettings):
         for name in ("act_with", "next_action_from"):
             if getattr(self, name) not in ("online", "target"):
                 raise ConfigError(one_of(f"value of `{name}`", getattr(self, name), ("online", "target")))
-
-    def lowest(self) -> dict[str, float]:
-        """The least value of each number that has one."""
-        return {**super().lowest(), "levels": 1, "bins": 2, "bc_margin": 0, "random_bin_below": 0}
 
 
 @dataclass(frozen=True)
@@ -119,15 +103,11 @@ class DrQv2Settings(CommonSettings):
     Raises ConfigError when a value is out of its range.
     """
 
-    atoms: int = 101
-    rl_loss_scale: float = 1.0
-    lr: float = 1e-4
-    tau: float = 0.01
-    noise_clip: float = 0.3  # of the noise on actions inside the losses (Yarats et al. 2022)
-
-    def lowest(self) -> dict[str, float]:
-        """The least value of each number that has one."""
-        return {**super().lowest(), "noise_clip": 0}
+    atoms: int = number(101, least=2)
+    rl_loss_scale: float = number(1.0, least=0)
+    lr: float = number(1e-4, above=0)
+    tau: float = number(0.01, above=0, most=1)
+    noise_clip: float = number(0.3, least=0)  # of the noise on actions inside the losses (Yarats et al. 2022)
 
 
 _DMC: dict[str, Any] = {

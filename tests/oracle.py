@@ -255,7 +255,14 @@ class Oracle:
     def update(self, batch: Batch) -> dict[str, Tensor]:
         """One pass of A2.11 to A2.21 on a batch that is not augmented yet."""
         observation, next_observation = self.augment(batch.observation), self.augment(batch.next_observation)
-        batch = Batch(observation, batch.action, batch.reward, batch.discount, next_observation, batch.demo)
+        batch = Batch(
+            observation=observation,
+            action=batch.action,
+            reward=batch.reward,
+            discount=batch.discount,
+            next_observation=next_observation,
+            demo=batch.demo,
+        )
         return self.update_augmented(batch)
 
     def update_augmented(self, batch: Batch) -> dict[str, Tensor]:

@@ -100,22 +100,31 @@ class Agent:
 
     def inside(self, bounds: Mapping[str, NDArray[Any]] | None) -> NDArray[Any]:
         """Which action dimensions [D] end before the environment's bounds (`min`, `max`) do: more is possible."""
+        if bounds is None:
+            return np.ones(self.policy.action_dims, dtype=bool)
         (scale,) = (step for step in self.postprocessor.steps if isinstance(step, UnnormalizerProcessorStep))
         ends = [torch.full((1, self.policy.action_dims), end) for end in (-1.0, 1.0)]
         extremes = [scale(create_transition(action=end))[TransitionKey.ACTION][0].cpu().numpy() for end in ends]
-        if bounds is None:
-            return np.ones(self.policy.action_dims, dtype=bool)
         near = 0.01 * (bounds["max"] - bounds["min"])
         room: NDArray[Any] = (extremes[0] > bounds["min"] + near) | (extremes[1] < bounds["max"] - near)
         return room
 
-    def pixels(self, frame: Frame) -> list[NDArray[Any]]:
-        """Images of a frame as the replay stores them: per view uint8 [K, 3, H, W]."""
-        missing = [key for key in self.policy.view_keys if key not in frame]
+    def pixels(self, prepared: Frame, given: Frame | None = None) -> list[NDArray[Any]]:
+        """Images of a prepared frame as the replay stores them: per view uint8 [K, 3, H, W].
+
+        given: the frame before it was prepared, whose images need not come back from the policy's device; those of
+        another size than the policy's were scaled on the way.
+        """
+        missing = [key for key in self.policy.view_keys if key not in prepared]
         if missing:
-            found = sorted(key for key in frame if key.startswith("observation.image"))
+            found = sorted(key for key in prepared if key.startswith("observation.image"))
             raise DataError(f"The policy needs the camera '{missing[0]}', the observation has {found or 'none'}.")
-        return [_to_uint8(frame[key]) for key in self.policy.view_keys]
+        views = []
+        for key in self.policy.view_keys:
+            own = None if given is None else given.get(key)
+            same = own is not None and own.dtype == torch.uint8 and own.shape == prepared[key].shape
+            views.append(_to_uint8(own if same and own is not None else prepared[key]))
+        return views
 
 
 def _to_uint8(pixels: torch.Tensor) -> NDArray[Any]:

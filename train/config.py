@@ -1,7 +1,6 @@
 """Settings of a run (`cqn-train --help`)."""
 
 from dataclasses import dataclass, field, fields, replace
-from operator import attrgetter
 from pathlib import Path
 
 from lerobot.configs.policies import PreTrainedConfig
@@ -12,20 +11,30 @@ from lerobot.teleoperators.config import TeleoperatorConfig
 from cqn_data.hub.options import check_repo_id
 from lerobot_cqn.base_config import RLConfig
 from lerobot_cqn.errors import ConfigError, one_of
+from lerobot_cqn.ranges import check_ranges, number
 
 from .robot.settings import ArmSettings
 
-__all__ = ["DatasetSettings", "EvalSettings", "PageSettings", "Recipe", "ReplaySettings", "RunConfig", "WandBSettings"]
+__all__ = [
+    "DatasetSettings",
+    "EvalSettings",
+    "PageSettings",
+    "Recipe",
+    "ReplaySettings",
+    "RunConfig",
+    "ValidRun",
+    "WandBSettings",
+]
 
 
 @dataclass(frozen=True)
 class Recipe:
     """How a run learns, where the paper gives each method numbers of its own; the defaults are CQN's on RLBench."""
 
-    updates_per_step: int = 1  # after each control step
-    updates_per_episode: int = 0  # between episodes
-    batch_size: int = 256  # from everything seen
-    demo_batch_size: int = 256  # from demonstrations and successes, on top
+    updates_per_step: int = number(1, least=0)  # after each control step
+    updates_per_episode: int = number(0, least=0)  # between episodes
+    batch_size: int = number(256, least=0)  # from everything seen
+    demo_batch_size: int = number(256, least=0)  # from demonstrations and successes, on top
     relabel: bool = True  # successful online episodes become demonstrations
     action_bounds: str = "data"  # action -1..1 is the demonstrations' range, or that of the "environment"
 
@@ -41,13 +50,6 @@ _RECIPES: dict[str, Recipe] = {
 }
 
 
-_LEAST: dict[str, int] = {
-    "steps": 0, "offline_updates": 0, "save_freq": 1, "log_freq": 1, "threads": 0, "seed": 0, "updates_per_step": 0,
-    "updates_per_episode": 0, "batch_size": 0, "demo_batch_size": 0, "eval.n_episodes": 1,
-    "eval.batch_size": 1, "eval.videos": 0, "async_updates": 0,
-}  # fmt: skip
-
-
 @dataclass
 class DatasetSettings:
     """Demonstrations: a LeRobotDataset v3, on disk under `root` or in LeRobot's cache or on the Hub."""
@@ -61,19 +63,22 @@ class DatasetSettings:
 class EvalSettings:
     """Evaluation episodes: deterministic policy, fixed seeds. On a real arm there are none unless asked for."""
 
-    freq: int | None = None  # environment steps between evaluations, 0: none on the way; None: 1000, on an arm 0
-    n_episodes: int = 20  # of each evaluation on the way
-    final_n_episodes: int | None = None  # after the offline phase and at the end; None: 50, on an arm 0
-    batch_size: int = 1  # episodes at a time, for one batch of actions
+    # environment steps between evaluations, 0: none on the way; None: 1000, on an arm 0
+    freq: int | None = number(None, least=0)
+    n_episodes: int = number(20, least=1)  # of each evaluation on the way
+    # after the offline phase and at the end; None: 50, on an arm 0
+    final_n_episodes: int | None = number(None, least=0)
+    batch_size: int = number(1, least=1)  # episodes at a time, for one batch of actions
     use_async_envs: bool = False  # each in a process of its own: worth it with cameras and several cores
-    videos: int = 0  # films of the first episodes of each evaluation, in output_dir/videos
+    videos: int = number(0, least=0)  # films of the first episodes of each evaluation, in output_dir/videos
 
 
 @dataclass
 class ReplaySettings:
     """Where experience is kept: in output_dir/replay, on disk, so that a kill loses no finished episode."""
 
-    capacity_gib: float = 16.0  # of the demonstrations and the run's episodes together; the oldest make room
+    # of the demonstrations and the run's episodes together; the oldest make room
+    capacity_gib: float = number(16.0, above=0)
     sampling: str = "episodes"  # uniform over episodes, then over their steps (the reference's); or over "steps"
 
 
@@ -82,8 +87,9 @@ class PageSettings:
     """The operator's page of a run on an arm. Its token is new in every run, or that of CQN_PAGE_TOKEN."""
 
     host: str = "127.0.0.1"  # another one lets other machines reach the page: whoever has the token moves the arm
-    port: int = 8765  # 0: any free one
-    absent_s: float = 10.0  # seconds without a sign of the operator's page after which the arm is paused
+    port: int = number(8765, least=0, most=65535)  # 0: any free one
+    # seconds without a sign of the operator's page after which the arm is paused
+    absent_s: float = number(10.0, least=1, most=3600)
 
 
 @dataclass
@@ -114,27 +120,29 @@ class RunConfig:
     dataset: DatasetSettings = field(default_factory=DatasetSettings)
     output_dir: Path | None = None  # a new or empty folder for checkpoints and metrics
     resume: bool = False  # continue the run in output_dir from its last checkpoint
-    seed: int = 1000  # of weights, batches, exploration and training scenes
-    steps: int = 30_000  # control steps online, then the episode is finished; 0 trains offline only
-    online_minutes: float | None = None  # of acting and learning, waits for a person not counted; None: `steps` alone
-    offline_updates: int = 0  # updates on the demonstrations before the first step
+    seed: int = number(1000, least=0)  # of weights, batches, exploration and training scenes
+    steps: int = number(30_000, least=0)  # control steps online, then the episode is finished; 0 trains offline only
+    # of acting and learning, waits for a person not counted; None: `steps` alone
+    online_minutes: float | None = number(None, above=0)
+    offline_updates: int = number(0, least=0)  # updates on the demonstrations before the first step
     updates_per_step: int | None = None  # after each control step; None: the preset's
     updates_per_episode: int | None = None  # between episodes; None: the preset's
-    async_updates: int = 0  # at most so many beside an episode; it acts with the policy it began with
+    async_updates: int = number(0, least=0)  # at most so many beside an episode; it acts with the policy it began with
     batch_size: int | None = None  # from everything seen; None: the preset's
     demo_batch_size: int | None = None  # from demonstrations and successes, on top; None: the preset's
     relabel: bool | None = None  # successful online episodes become demonstrations; None: the preset's
     action_bounds: str | None = None  # -1..1 is the range of the "data" or of the "environment"; None: the preset's
-    save_freq: int = 5000  # environment steps between checkpoints; the end and an interrupt always save
-    log_freq: int = 50  # updates between rows of updates.csv
-    threads: int = 0  # torch threads; 0 leaves torch's choice
+    # environment steps between checkpoints; the end and an interrupt always save
+    save_freq: int = number(5000, least=1)
+    log_freq: int = number(50, least=1)  # updates between rows of updates.csv
+    threads: int = number(0, least=0)  # torch threads; 0 leaves torch's choice
     replay: ReplaySettings = field(default_factory=ReplaySettings)
     eval: EvalSettings = field(default_factory=EvalSettings)
     tensorboard: bool = False  # the tables as TensorBoard events in output_dir/tensorboard, too
     wandb: WandBSettings = field(default_factory=WandBSettings)
 
-    def validate(self) -> None:
-        """Check what can be checked before work starts. Raises ConfigError."""
+    def validate(self) -> "ValidRun":
+        """The run, once all was checked that can be before work starts. Raises ConfigError."""
         if self.policy is None:
             raise ConfigError("No policy: give --policy.type=cqn, or --policy.path=CHECKPOINT to continue from one.")
         if not isinstance(self.policy, RLConfig):
@@ -145,7 +153,7 @@ class RunConfig:
             raise ConfigError("No output directory: give --output_dir=DIR.")
         if self.policy.push_to_hub:
             check_repo_id(self.policy.repo_id or "", "--policy.repo_id")
-        self._validate_arm()
+        acts_in = self._validated_world()
         recipe = self.recipe
         learns_from_data = recipe.demo_batch_size > 0 or self.offline_updates > 0
         if not self.dataset.repo_id and (learns_from_data or (recipe.action_bounds == "data" and not self.continues)):
@@ -153,36 +161,28 @@ class RunConfig:
                 "No demonstrations: give --dataset.repo_id=... (and --dataset.root=DIR when it is local), or train "
                 "without: --demo_batch_size=0 --action_bounds=environment --offline_updates=0."
             )
-        for name, least in _LEAST.items():
-            value = attrgetter(name)(recipe if hasattr(recipe, name) else self)
-            if value < least:
-                raise ConfigError(f"`{name}` must be at least {least}, got {value}.")
-        for name, value in (("eval.freq", self.eval_freq), ("eval.final_n_episodes", self.final_episodes)):
-            if value < 0:
-                raise ConfigError(f"`{name}` must be at least 0, got {value}.")
-        if not 0 < self.replay.capacity_gib < float("inf"):
-            raise ConfigError(f"`replay.capacity_gib` must be positive and finite, got {self.replay.capacity_gib}.")
+        for settings, prefix in ((self, ""), (recipe, ""), (self.eval, "eval."), (self.replay, "replay.")):
+            check_ranges(settings, prefix)
         if self.replay.sampling not in (valid := ("episodes", "steps")):
             raise ConfigError(one_of("replay.sampling", self.replay.sampling, valid))
         if recipe.action_bounds not in (valid := ("data", "environment")):
             raise ConfigError(one_of("action_bounds", recipe.action_bounds, valid))
+        return ValidRun(config=self, policy=self.policy, output_dir=self.output_dir, acts_in=acts_in)
 
-    def _validate_arm(self) -> None:
+    def _validated_world(self) -> EnvConfig | RobotConfig:
         if self.env is not None and self.robot is not None:
             raise ConfigError(
                 "Expected either an environment or an arm, got both: leave out --env.type or --robot.type."
             )
-        if self.env is None and self.robot is None:
+        if self.env is not None:
+            if self.teleop is not None:
+                raise ConfigError("--teleop.type is the leader of an arm: give --robot.type as well, or leave it out.")
+            return self.env
+        if self.robot is None:
             raise ConfigError(
                 "No environment and no arm: give --env.type=..., for example --env.type=ur5e_station, or "
                 "--robot.type=... (lerobot-train needs none)."
             )
-        if self.online_minutes is not None and not self.online_minutes > 0:
-            raise ConfigError(f"`online_minutes` must be positive, got {self.online_minutes}.")
-        if self.robot is None:
-            if self.teleop is not None:
-                raise ConfigError("--teleop.type is the leader of an arm: give --robot.type as well, or leave it out.")
-            return
         self.arm.validate()
         if self.eval.batch_size > 1 or self.eval.use_async_envs:
             raise ConfigError("There is one arm: leave out --eval.batch_size and --eval.use_async_envs.")
@@ -191,10 +191,8 @@ class RunConfig:
                 "Updates after each step would make the arm jerk: leave out --updates_per_step, or give "
                 "--updates_per_episode, or --async_updates."
             )
-        if not 0 <= self.page.port <= 65535:
-            raise ConfigError(f"`page.port` must be 0 to 65535, got {self.page.port}.")
-        if not 1 <= self.page.absent_s <= 3600:
-            raise ConfigError(f"`page.absent_s` must be 1 to 3600 seconds, got {self.page.absent_s}.")
+        check_ranges(self.page, "page.")
+        return self.robot
 
     @property
     def eval_freq(self) -> int:
@@ -222,3 +220,17 @@ class RunConfig:
         if self.robot is not None:  # the paper's on a real arm: no update while it moves
             recipe = replace(recipe, updates_per_step=0, updates_per_episode=recipe.updates_per_episode or 50)
         return replace(recipe, **{k: v for k, v in given.items() if v is not None})
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValidRun:
+    """A run whose settings were checked (`RunConfig.validate`), with nothing left open that a run must have.
+
+    config: the settings as given, for the loop and the checkpoint; policy: of a method that this trainer knows;
+    acts_in: an environment or an arm.
+    """
+
+    config: RunConfig
+    policy: RLConfig
+    output_dir: Path
+    acts_in: EnvConfig | RobotConfig

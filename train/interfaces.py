@@ -8,7 +8,19 @@ from typing import Any, Protocol
 import torch
 from numpy.typing import NDArray
 
-__all__ = ["PAGE_TOKEN", "Environment", "Frame", "Interrupted", "Label", "Outcome", "Outcomes", "Person", "Scenes"]
+__all__ = [
+    "PAGE_TOKEN",
+    "Environment",
+    "Frame",
+    "Interrupted",
+    "Label",
+    "Monitor",
+    "Nobody",
+    "Outcome",
+    "Outcomes",
+    "Person",
+    "Scenes",
+]
 
 Frame = dict[str, Any]
 # The variable that holds the token of the operator's page: one in an option would be saved with the run.
@@ -27,7 +39,7 @@ class Label(StrEnum):
     DISCARD = "discard"  # neither: not to be learned from
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Outcome:
     """What one control step brought.
 
@@ -109,7 +121,37 @@ class Person(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+class Monitor(Protocol):
+    """What a person sees while it runs."""
+
+    def phase(self, name: str, total: int, done: int) -> None:
+        """A phase of `total` units begins, `done` of them already behind."""
+        ...
+
+    def advance(self, done: int, note: str) -> None:
+        """Progress within the phase."""
+        ...
+
+    def message(self, text: str) -> None:
+        """A line that stays."""
+        ...
+
+
+class Nobody:
+    """The person of an environment that judges for itself."""
+
+    def expect(self, number: int | None) -> None:
+        """There is nobody to tell."""
+
+    def learning(self, doing: str) -> None:
+        """There is nobody to tell."""
+
+    def take_relabelled(self) -> dict[int, Label]:
+        """Nothing."""
+        return {}
+
+
+@dataclass(frozen=True, kw_only=True)
 class Outcomes:
     """What one control step brought in K scenes; `frame` has K rows, the arrays are [K]. skipped: as in `Outcome`."""
 

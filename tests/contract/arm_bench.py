@@ -40,7 +40,7 @@ def arm_limits() -> Limits:
     span, step = np.append(np.full(6, 20.0), 100.0), np.append(np.full(6, STEP_DEG), 100.0)
     low, high = HOME_DEG - span, HOME_DEG + span
     low[6], high[6] = 0.0, 100.0
-    return Limits(low, high, step, step * FPS)
+    return Limits(low=low, high=high, max_step=step, max_speed=step * FPS)
 
 
 class Display:

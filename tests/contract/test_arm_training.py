@@ -15,7 +15,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from cqn_train import cli
 from cqn_train.arguments import parse
 from cqn_train.arm.environment import ArmEnvironment
-from cqn_train.cli import build
+from cqn_train.build import build
 from cqn_train.interfaces import Interrupted, Label
 from cqn_train.loop.trainer import Trainer
 from cqn_train.operator.session import Event, RefusedError, Session, State
@@ -148,7 +148,7 @@ def run(
     """Train until the plan is done, the run is complete, or fails; returns the trainer, and whether it was stopped."""
     stopped = False
     with ConsoleMonitor() as monitor, contextlib.ExitStack() as stack:
-        trainer = build(parse(arguments), monitor, lambda: bool(asked), stack)
+        trainer = build(parse(arguments).validate(), monitor, lambda: bool(asked), stack)
         assert isinstance(trainer.env, ArmEnvironment)
         assert isinstance(trainer.person, Session)
         trainer.env.display = Screen()

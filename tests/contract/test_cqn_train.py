@@ -17,8 +17,9 @@ import torch
 from lerobot.configs.policies import PreTrainedConfig
 from safetensors.torch import load_file
 
-from cqn_train.cli import StopRequest, main
+from cqn_train.cli import main
 from cqn_train.run.metrics import COLUMNS
+from cqn_train.run.stop import StopRequest
 from lerobot_cqn.critic import CQNModel
 from lerobot_cqn.modeling_cqn import CQNPolicy
 

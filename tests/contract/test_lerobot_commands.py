@@ -17,8 +17,10 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from cqn_train.agent import Agent
-from cqn_train.cli import StopRequest, build, parse
+from cqn_train.arguments import parse
+from cqn_train.build import build
 from cqn_train.run.progress import ConsoleMonitor
+from cqn_train.run.stop import StopRequest
 from lerobot_cqn.intervals import snap
 
 from .conftest import STATION, TINY_POLICY, TINY_RUN, Command
@@ -143,7 +145,7 @@ def test_a_loaded_policy_acts_as_the_trained_one(act_with: str, click: list[str]
     flags = ["--policy.frame_stack=2", f"--policy.act_with={act_with}", "--policy.tau=0.3", "--policy.lr=0.01"]
     with ConsoleMonitor() as monitor, StopRequest() as stop, contextlib.ExitStack() as stack:
         config = parse([*TINY_RUN, *click, *flags, f"--output_dir={tmp_path / 'run'}"])
-        trainer = build(config, monitor, stop, stack)
+        trainer = build(config.validate(), monitor, stop, stack)
         for _ in range(20):
             trainer.updates(1)
         trainer.save()

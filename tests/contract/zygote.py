@@ -15,19 +15,19 @@ SERVE = """
 import itertools, json, os, signal, sys
 import {preload}
 from {module} import main
-import {module} as module
 
 def child(order):
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     os.dup2(1, 2)
     if order["dies_after_save"]:
-        saved, save = itertools.count(1), module.save
+        from cqn_train import build
+        saved, save = itertools.count(1), build.save
         def save_and_die(*args, **kwargs):
             written = save(*args, **kwargs)
             if next(saved) == order["dies_after_save"]:
                 os.kill(os.getpid(), signal.SIGKILL)
             return written
-        module.save = save_and_die
+        build.save = save_and_die
     return main(order["arguments"])
 
 answers = os.dup(1)

@@ -142,7 +142,16 @@ def check_critic(arrays: Mapping[str, np.ndarray]) -> Iterator[Deviation]:
     margin = demo_mean(margin_loss(probs @ model.support, indices, s.bc_margin), t["demo"])
     yield Deviation("bc_margin_loss", _relative(margin, arrays["bc_margin_loss"]), 1e-5)
 
-    Learner(model).update(Batch(observation, t["action"], t["reward"], t["discount"], next_observation, t["demo"]))
+    Learner(model).update(
+        Batch(
+            observation=observation,
+            action=t["action"],
+            reward=t["reward"],
+            discount=t["discount"],
+            next_observation=next_observation,
+            demo=t["demo"],
+        )
+    )
     for name, network in (("critic_after", model.critic), ("target_after", model.target_critic)):
         state = network.state_dict()
         worst = max(_absolute(state[k], v.numpy()) for k, v in network_weights(arrays, name).items())

@@ -51,7 +51,14 @@ def batch(made: CQNModel, demo: float = 1.0) -> Batch:
     low_dim = [torch.randn(B, P * made.settings.frame_stack) for _ in range(2)]
     action, reward = 2 * torch.rand(B, D) - 1, torch.rand(B, 1)
     discount, flags = torch.full((B, 1), 0.97), torch.full((B, 1), demo)
-    return Batch(Observation((), low_dim[0]), action, reward, discount, Observation((), low_dim[1]), flags)
+    return Batch(
+        observation=Observation((), low_dim[0]),
+        action=action,
+        reward=reward,
+        discount=discount,
+        next_observation=Observation((), low_dim[1]),
+        demo=flags,
+    )
 
 
 def parts(*flags: str, demo: float = 1.0) -> dict[str, float]:

@@ -37,7 +37,14 @@ def random_batch(views: int = 0, low_dim: int = P, demo: str = "some") -> Batch:
     flags = {"some": [1.0, 0.0, 1.0, 0.0, 0.0, 1.0], "none": [0.0] * SIZE}[demo]
     discount = torch.tensor([0.9, 0.0, 0.97, 0.97, 0.0, 1.0])[:, None]
     action = 2 * torch.rand(SIZE, DIMS) - 1
-    return Batch(observation(), action, torch.randn(SIZE, 1), discount, observation(), torch.tensor(flags)[:, None])
+    return Batch(
+        observation=observation(),
+        action=action,
+        reward=torch.randn(SIZE, 1),
+        discount=discount,
+        next_observation=observation(),
+        demo=torch.tensor(flags)[:, None],
+    )
 
 
 class Plain:

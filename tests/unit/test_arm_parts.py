@@ -13,6 +13,7 @@ from lerobot.policies.factory import make_pre_post_processors
 from cqn_train.agent import Agent
 from cqn_train.arm.build import _check_home, check_robot_fits, home_of, limits_of
 from cqn_train.config import DatasetSettings
+from cqn_train.replay.demonstrations import Demonstrations
 from cqn_train.robot.limits import Limits
 from cqn_train.robot.settings import ArmSettings
 from lerobot_cqn.configuration_cqn import CQNConfig
@@ -128,22 +129,22 @@ def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> DatasetSettings:
 
 
 def test_home_is_where_the_demonstrations_start(demonstrations: DatasetSettings) -> None:
-    assert home_of(demonstrations, robot(), ArmSettings()).tolist() == [2, 10, 50, 20]
+    assert home_of(Demonstrations(demonstrations), robot(), ArmSettings()).tolist() == [2, 10, 50, 20]
     given = ArmSettings(home={"gripper.pos": 0.0})
-    assert home_of(demonstrations, robot(), given).tolist() == [2, 10, 0, 20]
+    assert home_of(Demonstrations(demonstrations), robot(), given).tolist() == [2, 10, 0, 20]
     some = DatasetSettings("local/arm", demonstrations.root, [2])
-    assert home_of(some, robot(), ArmSettings()).tolist() == [30, 10, 50, 20]
+    assert home_of(Demonstrations(some), robot(), ArmSettings()).tolist() == [30, 10, 50, 20]
 
 
 def test_home_must_be_known_for_every_joint() -> None:
     everything = {name: float(i) for i, name in enumerate(ACTION_NAMES)}
-    assert home_of(DatasetSettings(), robot(), ArmSettings(home=everything)).tolist() == [0, 1, 2, 3]
+    assert home_of(None, robot(), ArmSettings(home=everything)).tolist() == [0, 1, 2, 3]
     with pytest.raises(ConfigError, match=r"Where is home for 'lift\.pos'\?.*--arm\.home='\{lift\.pos: 0\}'"):
-        home_of(DatasetSettings(), robot(), ArmSettings(home={"pan.pos": 1.0}))
+        home_of(None, robot(), ArmSettings(home={"pan.pos": 1.0}))
 
 
 def test_a_home_that_limits_keep_the_arm_from_is_refused() -> None:
-    limits = Limits(np.zeros(4), np.full(4, 10.0), np.ones(4), np.ones(4))
+    limits = Limits(low=np.zeros(4), high=np.full(4, 10.0), max_step=np.ones(4), max_speed=np.ones(4))
     _check_home(None, tuple(ACTION_NAMES), limits)
     _check_home(np.array([0.0, 10.0, 5.0, 3.0]), tuple(ACTION_NAMES), limits)
     with pytest.raises(ConfigError, match=r"Home of 'lift\.pos' is 12, its limits are 0 to 10"):

@@ -56,7 +56,17 @@ def parts() -> tuple[Agent, Learner, Replay]:
     for _ in range(2):
         state = rng.normal(size=(5, 2)).astype(np.float32)
         action = rng.uniform(-1, 1, (4, 2)).astype(np.float32)
-        replay.add(Episode(state, (), action, np.array([0, 0, 0, 1], np.float32), True, True), demo=True)
+        replay.add(
+            Episode(
+                low_dim=state,
+                pixels=(),
+                action=action,
+                reward=np.array([0, 0, 0, 1], np.float32),
+                terminated=True,
+                success=True,
+            ),
+            demo=True,
+        )
     return Agent(policy, *make_cqn_pre_post_processors(config)), Learner(policy.model), replay
 
 

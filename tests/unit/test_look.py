@@ -21,7 +21,7 @@ def demonstration(seed: int, *, still: float = 0.0, narrow: bool = False, succes
     action[:, 2] = 1  # a shut gripper is no bound
     reward = np.zeros(60, np.float32)
     reward[-1] = success
-    return Episode(state, (), action, reward, success, success)
+    return Episode(low_dim=state, pixels=(), action=action, reward=reward, terminated=success, success=success)
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,17 @@ def test_the_picture_of_a_batch_shows_every_view_twice(tmp_path: Path, views: in
     episode = demonstration(0)
     pixels = tuple(np.full((61, 3, 8, 8), 80 * (view + 1), np.uint8) for view in range(views))
     replay = Replay(2, 3, 0.9)
-    replay.add(Episode(episode.low_dim, pixels, episode.action, episode.reward, True, True), demo=True)
+    replay.add(
+        Episode(
+            low_dim=episode.low_dim,
+            pixels=pixels,
+            action=episode.action,
+            reward=episode.reward,
+            terminated=True,
+            success=True,
+        ),
+        demo=True,
+    )
     batch = replay.sample(3, 2, np.random.default_rng(0))
     draw_batch(batch, tmp_path / "first_batch.png")
     picture = np.asarray(Image.open(tmp_path / "first_batch.png"))

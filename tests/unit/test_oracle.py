@@ -48,7 +48,14 @@ def random_batch(model: CQNModel, views: int, low_dim: int, demo: str = "some", 
     flags = {"some": [1.0, 0.0, 1.0, 0.0, 0.0, 1.0], "none": [0.0] * size, "all": [1.0] * size}[demo]
     discount = torch.tensor([0.9, 0.0, 0.97, 0.97, 0.0, 1.0])[:, None]
     action = 2 * torch.rand(size, model.critic.dims) - 1
-    return Batch(observation(), action, torch.randn(size, 1), discount, observation(), torch.tensor(flags)[:, None])
+    return Batch(
+        observation=observation(),
+        action=action,
+        reward=torch.randn(size, 1),
+        discount=discount,
+        next_observation=observation(),
+        demo=torch.tensor(flags)[:, None],
+    )
 
 
 def compare(views: int, low_dim: int, dims: int, demo: str = "some", updates: int = 3, **changes: object) -> None:

@@ -14,7 +14,7 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from cqn_train.agent import Agent
 from cqn_train.config import DatasetSettings
 from cqn_train.replay.buffer import Replay
-from cqn_train.replay.demonstrations import load_episodes, load_metadata
+from cqn_train.replay.demonstrations import Demonstrations, load_metadata
 from lerobot_cqn.configuration_cqn import CQNConfig
 from lerobot_cqn.errors import ConfigError, DataError
 from lerobot_cqn.modeling_cqn import CQNPolicy
@@ -54,7 +54,7 @@ def loader_batch(root: Path, meta: LeRobotDatasetMetadata, agent: Agent) -> Batc
 def replay_batch(root: Path, agent: Agent, n_step: int, stack: int) -> Batch:
     """The same steps from the replay."""
     replay = Replay(stack, n_step, agent.policy.config.settings.discount)
-    for episode in load_episodes(DatasetSettings("local/toy", str(root)), agent):
+    for episode in Demonstrations(DatasetSettings("local/toy", str(root))).episodes(agent):
         replay.add(episode, demo=True)
     places = [(episode, step) for episode, length in enumerate(LENGTHS) for step in range(length)]
     return replay._assemble(*(np.array(column) for column in zip(*places, strict=True)))

@@ -21,15 +21,15 @@ def make_episode(number: int, length: int, *, terminated: bool = True, views: in
     marks = 100 * number + np.arange(length + 1)
     rng = np.random.default_rng(number)
     return Episode(
-        np.stack([marks, -marks], axis=1).astype(np.float32),
-        tuple(
+        low_dim=np.stack([marks, -marks], axis=1).astype(np.float32),
+        pixels=tuple(
             np.broadcast_to((view + marks % 251)[:, None, None, None], (length + 1, 3, SIDE, SIDE)).astype(np.uint8)
             for view in range(views)
         ),
-        np.repeat(1 / (marks[:-1, None] + 1.0), D, axis=1).astype(np.float32),
-        rng.normal(size=length).astype(np.float32),
-        terminated,
-        terminated,
+        action=np.repeat(1 / (marks[:-1, None] + 1.0), D, axis=1).astype(np.float32),
+        reward=rng.normal(size=length).astype(np.float32),
+        terminated=terminated,
+        success=terminated,
     )
 
 
@@ -149,7 +149,17 @@ def test_the_same_generator_draws_the_same_batch() -> None:
 def test_pixels_without_state() -> None:
     filmed = make_episode(0, 4, views=1)
     replay = Replay(2, 1, GAMMA)
-    replay.add(Episode(None, filmed.pixels, filmed.action, filmed.reward, True, True), demo=True)
+    replay.add(
+        Episode(
+            low_dim=None,
+            pixels=filmed.pixels,
+            action=filmed.action,
+            reward=filmed.reward,
+            terminated=True,
+            success=True,
+        ),
+        demo=True,
+    )
     batch = replay.sample(4, 0, np.random.default_rng(0))
     assert batch.observation.low_dim is None
     assert batch.observation.pixels[0].shape == (4, 6, SIDE, SIDE)
@@ -193,10 +203,24 @@ def test_shapes_must_fit_and_steps_must_exist() -> None:
         replay.add(empty, demo=True)
     replay.add(make_episode(0, 3, views=1), demo=True)
     other = make_episode(1, 3, views=1)
-    wide = Episode(other.low_dim, other.pixels, other.action[:, :2], other.reward, True, True)
+    wide = Episode(
+        low_dim=other.low_dim,
+        pixels=other.pixels,
+        action=other.action[:, :2],
+        reward=other.reward,
+        terminated=True,
+        success=True,
+    )
     with pytest.raises(DataError, match="do not fit"):
         replay.add(wide, demo=True)
-    blurred = Episode(other.low_dim, (other.pixels[0][..., :2],), other.action, other.reward, True, True)
+    blurred = Episode(
+        low_dim=other.low_dim,
+        pixels=(other.pixels[0][..., :2],),
+        action=other.action,
+        reward=other.reward,
+        terminated=True,
+        success=True,
+    )
     with pytest.raises(DataError, match="do not fit"):
         replay.add(blurred, demo=True)
 

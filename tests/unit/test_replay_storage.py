@@ -168,7 +168,7 @@ def test_uniform_over_steps_when_asked() -> None:
 
 def test_the_journal_is_plain_lines(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "episodes.jsonl")
-    place = Place(3, 4, True, True, False, 7, {"x": 1.5})
+    place = Place(start=3, length=4, terminated=True, success=True, demo=False, number=7, note={"x": 1.5})
     journal.announce(3, 8)
     journal.complete(place)
     journal.announce(8, 12)
@@ -186,7 +186,17 @@ def test_a_first_episode_that_is_refused_decides_nothing() -> None:
     bad.action[1] = np.nan
     with pytest.raises(DataError):
         replay.add(bad, demo=True)
-    replay.add(Episode(None, (), np.zeros((2, 1), np.float32), np.zeros(2, np.float32), False, False), demo=False)
+    replay.add(
+        Episode(
+            low_dim=None,
+            pixels=(),
+            action=np.zeros((2, 1), np.float32),
+            reward=np.zeros(2, np.float32),
+            terminated=False,
+            success=False,
+        ),
+        demo=False,
+    )
     assert replay.episodes == 1
 
 

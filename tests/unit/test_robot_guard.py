@@ -82,14 +82,6 @@ def test_limits_that_make_no_sense(changes: dict[str, Any], said: str) -> None:
         limits(**changes)
 
 
-def test_limits_from_ranges() -> None:
-    made = Limits.from_ranges(("a", "b"), {"a": (0.0, 10.0), "b": (-5.0, 5.0)}, 0.1, 1.0)
-    assert made.max_step.tolist() == [1.0, 1.0]
-    assert made.max_speed.tolist() == [10.0, 10.0]
-    with pytest.raises(ConfigError, match="No limits for the joint 'c'"):
-        Limits.from_ranges(("c",), {}, 0.1, 1.0)
-
-
 class Motors:
     """Stands in for a robot: remembers every goal, follows at once, and fails on request."""
 

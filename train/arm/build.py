@@ -1,4 +1,4 @@
-"""The parts of a run on an arm, checked and put together: robot, leader, limits, home, page or keys."""
+"""Parts of a run on an arm, checked to fit one another: robot, leader, limits, home, page or keys."""
 
 import contextlib
 import os
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from lerobot.configs.types import FeatureType
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.robots.config import RobotConfig
 from lerobot.robots.robot import Robot
 from lerobot.robots.utils import make_robot_from_config
 from lerobot.teleoperators.utils import make_teleoperator_from_config
@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from lerobot_cqn.errors import ConfigError, DataError, one_of
 
 from ..agent import Agent
-from ..config import DatasetSettings, RunConfig
+from ..config import RunConfig
 from ..interfaces import PAGE_TOKEN
 from ..operator.board import Board
 from ..operator.session import Session
-from ..replay.demonstrations import load_metadata
+from ..replay.demonstrations import Demonstrations
 from ..robot.arm import Arm, state_names
 from ..robot.guard import Guard, GuardSettings
 from ..robot.limits import Forward, Limits
@@ -49,24 +49,27 @@ class Operated:
 
 
 def make_operated(
-    config: RunConfig, agent: Agent, should_stop: Callable[[], bool], say: Callable[[str], None]
+    robot_config: RobotConfig,
+    config: RunConfig,
+    agent: Agent,
+    demonstrations: Demonstrations | None,
+    should_stop: Callable[[], bool],
+    say: Callable[[str], None],
 ) -> Operated:
-    """Make robot and leader and check that they fit the policy; nothing is connected yet.
+    """Robot, leader and session, checked to fit the policy; nothing is connected yet.
 
     say: shows a warning. Raises ConfigError or DataError in one line.
     """
-    assert config.robot is not None  # noqa: S101  # the caller asks only then
-    robot = _made("robot", make_robot_from_config, config.robot)
+    robot = _made("robot", make_robot_from_config, robot_config)
     leader = _made("teleop", make_teleoperator_from_config, config.teleop) if config.teleop is not None else None
     check_robot_fits(robot, agent)
-    meta = load_metadata(config.dataset) if config.dataset.repo_id else None
-    if meta is not None:
-        _check_names(robot, meta.features)
-    fps = config.arm.fps or (int(meta.fps) if meta is not None else None)
+    if demonstrations is not None:
+        _check_names(robot, demonstrations.meta.features)
+    fps = config.arm.fps or (int(demonstrations.meta.fps) if demonstrations is not None else None)
     if fps is None:
         raise ConfigError("How many control steps a second? Give --arm.fps (that of the demonstrations).")
     limits = limits_of(robot, agent, config.arm, fps)
-    home = home_of(config.dataset, robot, config.arm) if meta is not None or config.arm.home else None
+    home = home_of(demonstrations, robot, config.arm) if demonstrations is not None or config.arm.home else None
     names = tuple(robot.action_features)
     _check_home(home, names, limits)
     settings = GuardSettings(config.arm.stale_s, config.arm.watchdog_s)
@@ -79,7 +82,7 @@ def make_operated(
         )
     session = Session(leader=leader is not None, can_free=arm.guard.can_release)
     board = Board(session)
-    if config.arm.on_exit == "hold" and getattr(config.robot, "disable_torque_on_disconnect", False):
+    if config.arm.on_exit == "hold" and getattr(robot_config, "disable_torque_on_disconnect", False):
         say(
             "Warning: this robot lets its motors go when it is disconnected, so the arm falls at the end of the run: "
             "give --robot.disable_torque_on_disconnect=false to hold it."
@@ -172,20 +175,19 @@ def limits_of(robot: Robot, agent: Agent, settings: ArmSettings, fps: int) -> Li
     if settings.workspace is not None:
         corners = np.array(settings.workspace, dtype=np.float64).reshape(3, 2)
         box = corners[:, 0], corners[:, 1]
-    return Limits(low, high, step, step * fps, box, _forward(robot, settings) if box is not None else None)
+    forward = _forward(robot, settings) if box is not None else None
+    return Limits(low=low, high=high, max_step=step, max_speed=step * fps, box=box, forward=forward)
 
 
-def home_of(dataset: DatasetSettings, robot: Robot, settings: ArmSettings) -> Array:
-    """Where the demonstrations start: the median of their first joints [D]; `arm.home` on top. Raises ConfigError."""
+def home_of(demonstrations: Demonstrations | None, robot: Robot, settings: ArmSettings) -> Array:
+    """Home [D], where the demonstrations start: the median of their first joints; `arm.home` on top.
+
+    Raises ConfigError for a joint of which neither says it.
+    """
     names, home = tuple(robot.action_features), dict[str, float]()
-    if dataset.repo_id:
-        data = LeRobotDataset(dataset.repo_id, root=dataset.root, episodes=dataset.episodes)
-        columns = data.hf_dataset.with_format("numpy")
-        first = np.unique(np.asarray(columns["episode_index"]), return_index=True)[1]
-        states = state_names(robot)
-        if OBS_STATE in data.features:
-            median = np.median(np.stack([columns[int(row)][OBS_STATE] for row in first]), axis=0)
-            home = dict(zip(states, median.tolist(), strict=True))
+    first = demonstrations.first_states() if demonstrations is not None else None
+    if first is not None:
+        home = dict(zip(state_names(robot), np.median(first, axis=0).tolist(), strict=True))
     home |= settings.home
     missing = [name for name in names if name not in home]
     if missing:

@@ -127,7 +127,9 @@ class ArmEnvironment:
             self._time_up()
         label = self._label()
         if label is None:
-            return Outcome(frame, 0.0, False, False, False, goal, teaching)
+            return Outcome(
+                frame=frame, reward=0.0, terminated=False, truncated=False, success=False, sent=goal, taught=teaching
+            )
         return self._ended(frame, label, out_of_time=timed_out, sent=goal, taught=teaching)
 
     def render(self) -> NDArray[Any]:
@@ -191,7 +193,7 @@ class ArmEnvironment:
                 self._attendant.fault(error)
                 continue
             self._pace.start()
-            return Outcome(frame, 0.0, False, False, False, skipped=True)
+            return Outcome(frame=frame, reward=0.0, terminated=False, truncated=False, success=False, skipped=True)
 
     def _ended(self, frame: Frame, label: Label, *, out_of_time: bool, **more: Any) -> Outcome:
         self.display.end_episode(self.session.episode, self._steps, time.monotonic() - self._began)
@@ -201,8 +203,14 @@ class ArmEnvironment:
         if self.arm.settings.go_home and self.arm.home is not None:
             self._attendant.go_home()
         return Outcome(
-            frame, float(success), terminated, not terminated, success, discarded=discarded, **more
-        )  # fmt: skip
+            frame=frame,
+            reward=float(success),
+            terminated=terminated,
+            truncated=not terminated,
+            success=success,
+            discarded=discarded,
+            **more,
+        )
 
     def _time_up(self) -> None:
         while self._label() is None:

@@ -7,17 +7,19 @@ import gymnasium as gym
 import numpy as np
 import torch
 from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.types import FeatureType
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.factory import make_env, make_env_pre_post_processors
-from lerobot.envs.utils import preprocess_observation
-from lerobot.utils.constants import ACTION
+from lerobot.envs.utils import env_to_policy_features, preprocess_observation
+from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_IMAGES
 from numpy.typing import NDArray
 
+from lerobot_cqn.base_policy import RLPolicy
 from lerobot_cqn.errors import ConfigError, DataError
 
 from ..interfaces import Environment, Frame, Outcome, Outcomes
 
-__all__ = ["GymEnvironment", "GymScenes", "OneScene"]
+__all__ = ["GymEnvironment", "GymScenes", "OneScene", "check_fits"]
 
 NEW_EPISODE = {"lerobot_new_rollout": True}  # as lerobot-eval marks a reset
 
@@ -59,8 +61,11 @@ class _Gym:
 
     def frame(self, observation: Any) -> Frame:
         """An observation under LeRobot's names."""
-        frame: Frame = self._pre(preprocess_observation(observation))
-        return frame
+        frame: Frame = preprocess_observation(observation)
+        if not self._pre.steps:  # else they expect the pictures as LeRobot makes them, floats
+            frame |= _pictures(observation)
+        prepared: Frame = self._pre(frame)
+        return prepared
 
 
 class GymEnvironment(_Gym):
@@ -90,7 +95,13 @@ class GymEnvironment(_Gym):
         """Apply an action [1, D] in the environment's own units."""
         observation, reward, terminated, truncated, info = self.env.step(self.command(action)[0])
         success = bool(info.get("is_success", info.get("succeed", False)))
-        return Outcome(self.frame(observation), float(reward), bool(terminated), bool(truncated), success)
+        return Outcome(
+            frame=self.frame(observation),
+            reward=float(reward),
+            terminated=bool(terminated),
+            truncated=bool(truncated),
+            success=success,
+        )
 
     def action_bounds(self) -> dict[str, NDArray[Any]] | None:
         """`min` and `max` of the action, [D] each; None where the environment does not bound it."""
@@ -122,16 +133,66 @@ class GymScenes(_Gym):
         # What an episode ended with is set aside when the next one begins within the same step.
         success = _successes(info, self.count) | _successes(info.get("final_info", {}), self.count)
         ended = np.asarray(terminated) | np.asarray(truncated) | success
-        return Outcomes(self.frame(observation), np.asarray(reward, np.float64), ended, success)
+        return Outcomes(
+            frame=self.frame(observation), reward=np.asarray(reward, np.float64), ended=ended, success=success
+        )
 
     def render(self) -> Sequence[NDArray[Any]]:
         """K pictures for a person, uint8 [H, W, 3]."""
         return [np.asarray(picture, dtype=np.uint8) for picture in self.vector.call("render")]
 
 
+def _pictures(observation: Mapping[str, Any]) -> Frame:
+    """Pictures as the environment gave them, uint8 [K, 3, H, W], under LeRobot's names."""
+    pixels, frame = observation.get("pixels", {}), Frame()
+    several = isinstance(pixels, Mapping)
+    named = {f"{OBS_IMAGES}.{name}": picture for name, picture in pixels.items()} if several else {OBS_IMAGE: pixels}
+    for key, picture in named.items():
+        channels_first = np.moveaxis(picture, -1, -3)
+        # A copy: an environment may draw its next picture into the same memory.
+        frame[key] = torch.from_numpy(np.array(channels_first, order="C").reshape(-1, *channels_first.shape[-3:]))
+    return frame
+
+
 def _successes(info: Mapping[str, Any], count: int) -> NDArray[Any]:
     """Which of `count` environments report success, [K] bool."""
     return np.asarray(info.get("is_success", info.get("succeed", np.zeros(count))), dtype=bool)
+
+
+def check_fits(env: EnvConfig, policy: RLPolicy, source: str) -> None:
+    """Environment and policy must speak of the same things. Raises ConfigError, in one line, where they do not.
+
+    source: where the policy's features come from, for the message.
+    """
+    given, needed = env_to_policy_features(env), policy.config.input_features or {}
+    for key, feature in needed.items():
+        if key not in given:
+            raise ConfigError(
+                f"The {source} has '{key}', which the environment does not give (it gives {sorted(given)}): "
+                "change --env.obs_type / --env.cameras, or train on a dataset with these features."
+            )
+        if tuple(given[key].shape) != tuple(feature.shape):
+            raise ConfigError(
+                f"'{key}' has shape {tuple(given[key].shape)} in the environment, but {tuple(feature.shape)} in the "
+                f"{source}: "
+                + (
+                    "set --env.image_size or resize the dataset (cqn-data resize)."
+                    if feature.type is FeatureType.VISUAL
+                    else "use the environment of the demonstrations."
+                )
+            )
+    unseen = [key for key, f in given.items() if f.type is FeatureType.VISUAL and key not in needed]
+    if unseen:
+        raise ConfigError(
+            f"The {source} has not the environment's camera '{unseen[0]}': leave it out (--env.cameras, or "
+            "--env.obs_type=state for none), or use a dataset with it."
+        )
+    action = next(f for f in given.values() if f.type is FeatureType.ACTION)
+    if action.shape[0] != policy.action_dims:
+        raise ConfigError(
+            f"The environment's action has {action.shape[0]} dimensions, the {source}'s "
+            f"{policy.action_dims}: use the environment the demonstrations were recorded in."
+        )
 
 
 class OneScene:
@@ -156,9 +217,12 @@ class OneScene:
         outcome = self.env.step(action)
         ended = outcome.success or outcome.ended
         return Outcomes(
-            outcome.frame, np.array([outcome.reward]), np.array([ended]), np.array([outcome.success], dtype=bool),
-            outcome.skipped,
-        )  # fmt: skip
+            frame=outcome.frame,
+            reward=np.array([outcome.reward]),
+            ended=np.array([ended]),
+            success=np.array([outcome.success], dtype=bool),
+            skipped=outcome.skipped,
+        )
 
     def render(self) -> Sequence[NDArray[Any]]:
         """One picture."""

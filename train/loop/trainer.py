@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from lerobot_cqn.schema import Batch
 
 from ..agent import Agent
 from ..config import RunConfig
-from ..interfaces import Environment, Interrupted, Label, Outcome, Person, Scenes
+from ..interfaces import Environment, Interrupted, Label, Monitor, Outcome, Person, Scenes
 from ..replay.buffer import Episode, Replay
 from ..replay.files import Place
 from ..replay.recorder import Recorder
@@ -24,45 +24,15 @@ from ..run.metrics import Metrics
 from .background import Background
 from .evaluate import Evaluation, evaluate
 
-__all__ = ["Monitor", "Nobody", "Trainer"]
+__all__ = ["Trainer"]
 
 RECENT = 20  # training episodes in the progress line
 SET_ASIDE = 5  # discarded episodes that may still be labelled otherwise
 
 
-class Monitor(Protocol):
-    """What a person sees while it runs."""
-
-    def phase(self, name: str, total: int, done: int) -> None:
-        """A phase of `total` units begins, `done` of them already behind."""
-        ...
-
-    def advance(self, done: int, note: str) -> None:
-        """Progress within the phase."""
-        ...
-
-    def message(self, text: str) -> None:
-        """A line that stays."""
-        ...
-
-
-class Nobody:
-    """The person of an environment that judges for itself."""
-
-    def expect(self, number: int | None) -> None:
-        """There is nobody to tell."""
-
-    def learning(self, doing: str) -> None:
-        """There is nobody to tell."""
-
-    def take_relabelled(self) -> dict[int, Label]:
-        """Nothing."""
-        return {}
-
-
-@dataclass
+@dataclass(kw_only=True)
 class Trainer:
-    """Everything the loop touches; made by `cli.py`, the only composition root."""
+    """Everything the loop touches."""
 
     config: RunConfig
     agent: Agent
@@ -76,9 +46,9 @@ class Trainer:
     counters: Counters
     save: Callable[[], None]
     should_stop: Callable[[], bool]
+    person: Person
     evaluations: list[tuple[str, Evaluation]] = field(default_factory=list)
     finished_since: Sequence[Place] = ()
-    person: Person = field(default_factory=Nobody)
     _aside: dict[int, tuple[Episode, dict[str, Any]]] = field(default_factory=dict)
     _recent: list[bool] = field(default_factory=list)
     _clock: float = field(default_factory=time.monotonic)
@@ -136,8 +106,9 @@ class Trainer:
         self.agent.reset()
         self.person.expect(c.episodes)
         # The seed follows from the episode's number: a resumed run meets the same scenes.
-        prepared = self.agent.prepare(self.env.reset(self.config.seed * 100_000 + c.episodes))
-        recorder.observe(prepared)
+        frame = self.env.reset(self.config.seed * 100_000 + c.episodes)
+        prepared = self.agent.prepare(frame)
+        recorder.observe(prepared, frame)
         q_values: list[float] = []
         ended = False
         try:
@@ -148,11 +119,11 @@ class Trainer:
                     executed = agent.carried_out(action, outcome)
                     prepared = agent.prepare(outcome.frame)
                     if outcome.skipped:
-                        recorder.retake(prepared, outcome.reward)
+                        recorder.retake(prepared, outcome.frame, outcome.reward)
                         agent.retake(first=not len(recorder))
                     else:
                         recorder.step(executed, outcome.reward, taught=outcome.taught)
-                        recorder.observe(prepared)
+                        recorder.observe(prepared, outcome.frame)
                         q_values.append(q)
                         c.env_steps += 1
                         self.updates(self.config.recipe.updates_per_step)
@@ -194,14 +165,13 @@ class Trainer:
         for number, label in self.person.take_relabelled().items():
             success = label is Label.SUCCESS
             demo = self.config.recipe.relabel and success
-            if number in self._aside and label is not Label.DISCARD:
-                episode, row = self._aside.pop(number)
-                self.replay.add(replace(episode, terminated=True), demo=demo, number=number, note=row)
-                self.metrics.write("episodes", row | {"success": int(success)})
-                there = self.replay.relabel(number, success=success, demo=demo)
-            elif label is Label.DISCARD:
+            if label is Label.DISCARD:
                 there = self.replay.forget(number)
             else:
+                if number in self._aside:
+                    episode, row = self._aside.pop(number)
+                    self.replay.add(replace(episode, terminated=True), demo=demo, number=number, note=row)
+                    self.metrics.write("episodes", row | {"success": int(success)})
                 there = self.replay.relabel(number, success=success, demo=demo)
             gone = "" if there else " It is not in the replay any more: nothing changes."
             self.monitor.message(f"Episode {number} is a {label} now.{gone}")

@@ -23,7 +23,7 @@ BATCHES = 4  # whose pictures are in memory at a time
 SAMPLED = [("start", int), ("length", int), ("terminated", bool), ("demo", bool), ("first", int), ("last", int)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Episode:
     """One episode of T steps and T + 1 observations.
 
@@ -136,7 +136,15 @@ class Replay:
                 " make the pictures smaller (cqn-data resize)."
             )
         self._write(arrays, start, stop)
-        self._keep(Place(start, len(episode), episode.terminated, episode.success, episode.success))
+        self._keep(
+            Place(
+                start=start,
+                length=len(episode),
+                terminated=episode.terminated,
+                success=episode.success,
+                demo=episode.success,
+            )
+        )
         self._fixed, self._ring, self._head = self.episodes, stop, stop
 
     def add(self, episode: Episode, *, demo: bool, number: int = -1, note: dict[str, Any] | None = None) -> None:
@@ -148,7 +156,14 @@ class Replay:
         arrays = self._checked(episode)
         start = self._head if self._head + len(episode) + 1 <= self.capacity else self._ring
         place = Place(
-            start, len(episode), episode.terminated, episode.success, demo, number, note or {}, episode.taught
+            start=start,
+            length=len(episode),
+            terminated=episode.terminated,
+            success=episode.success,
+            demo=demo,
+            number=number,
+            note=note or {},
+            taught=episode.taught,
         )
         if place.stop > self.capacity:
             raise ConfigError(
@@ -250,12 +265,12 @@ class Replay:
         ended = (step + window == length) & table["terminated"][episode]
         discount = np.where(ended, 0.0, self.discount**window)[:, None]
         return Batch(
-            self._observation(start, step),
-            self._rows["action"].take(start + step),
-            torch.from_numpy(reward.astype(np.float32)),
-            torch.from_numpy(discount.astype(np.float32)),
-            self._observation(start, step + window),
-            torch.from_numpy(self._shown(episode, step)[:, None].astype(np.float32)),
+            observation=self._observation(start, step),
+            action=self._rows["action"].take(start + step),
+            reward=torch.from_numpy(reward.astype(np.float32)),
+            discount=torch.from_numpy(discount.astype(np.float32)),
+            next_observation=self._observation(start, step + window),
+            demo=torch.from_numpy(self._shown(episode, step)[:, None].astype(np.float32)),
         )
 
     def _shown(self, episode: NDArray[Any], step: NDArray[Any]) -> NDArray[Any]:

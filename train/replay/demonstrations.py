@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME
+from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from numpy.typing import NDArray
 
@@ -20,7 +21,7 @@ from ..agent import Agent
 from ..config import DatasetSettings
 from .buffer import Episode
 
-__all__ = ["load_episodes", "load_metadata"]
+__all__ = ["Demonstrations", "load_metadata"]
 
 logger = logging.getLogger(__name__)
 
@@ -52,66 +53,91 @@ def load_metadata(settings: DatasetSettings) -> LeRobotDatasetMetadata:
     return meta
 
 
-def load_episodes(
-    settings: DatasetSettings, agent: Agent, on_episode: Callable[[int, int], None] = lambda _i, _n: None
-) -> list[Episode]:
-    """All demonstrations, in the policy's normalised units, cut after their first success.
+class Demonstrations:
+    """Demonstrations of a LeRobotDataset: metadata is read when this is made, rows and pictures when asked for.
 
-    Without a reward column the last step of each episode counts as the success (reward 1), and a line says so.
-    Datasets do not store what came after the last action: the last observation stands in for it.
-    Raises DataError for a missing feature, another size, or values that are not finite.
+    Raises DataError as `load_metadata`.
+
+    Attributes:
+        meta: LeRobot's metadata of the dataset.
     """
-    load_metadata(settings)
-    dataset = LeRobotDataset(settings.repo_id, root=settings.root, episodes=settings.episodes)
-    policy = agent.policy
-    missing = [key for key in (*policy.view_keys, *policy.low_dim_keys, ACTION) if key not in dataset.features]
-    if missing:
-        raise DataError(
-            f"The dataset has no '{missing[0]}', which the policy needs; it has {sorted(dataset.features)}."
-        )
-    found = dataset_to_policy_features(dataset.features)
-    for key, feature in {**(policy.config.input_features or {}), ACTION: policy.config.action_feature}.items():
-        if tuple(found[key].shape) != tuple(feature.shape):
+
+    def __init__(self, settings: DatasetSettings) -> None:
+        self.settings, self.meta = settings, load_metadata(settings)
+
+    @cached_property
+    def dataset(self) -> LeRobotDataset:
+        """The dataset, with the chosen episodes only."""
+        return LeRobotDataset(self.settings.repo_id, root=self.settings.root, episodes=self.settings.episodes)
+
+    def first_states(self) -> NDArray[Any] | None:
+        """The state at the start of each episode, [K, P]; None where none was recorded."""
+        if OBS_STATE not in self.dataset.features:
+            return None
+        columns = self.dataset.hf_dataset.with_format("numpy")
+        first = np.unique(np.asarray(columns["episode_index"]), return_index=True)[1]
+        return np.stack([columns[int(row)][OBS_STATE] for row in first])
+
+    def episodes(self, agent: Agent, on_episode: Callable[[int, int], None] = lambda _i, _n: None) -> list[Episode]:
+        """Episodes, in the policy's normalised units, cut after their first success.
+
+        Without a reward column the last step of each episode counts as the success (reward 1), and a line says so.
+        Datasets do not store what came after the last action: the last observation stands in for it.
+        Raises DataError for a missing feature, another size, or values that are not finite.
+        """
+        dataset, policy = self.dataset, agent.policy
+        missing = [key for key in (*policy.view_keys, *policy.low_dim_keys, ACTION) if key not in dataset.features]
+        if missing:
             raise DataError(
-                f"'{key}' has shape {tuple(found[key].shape)} in the dataset, but {tuple(feature.shape)} in the "
-                "policy: train a new policy, or give the dataset this one was trained on."
+                f"The dataset has no '{missing[0]}', which the policy needs; it has {sorted(dataset.features)}."
             )
-    rewarded = NEXT_REWARD in dataset.features
-    columns = dataset.hf_dataset.with_format("numpy")
-    numbers = np.asarray(columns["episode_index"])
-    raw = {key: _column(columns, key) for key in (*policy.low_dim_keys, ACTION, *([NEXT_REWARD] if rewarded else []))}
-    _check_finite(raw, numbers)
-    if not rewarded:
-        logger.warning("No '%s' column: the last step of each episode counts as the success.", NEXT_REWARD)
-    vectors = {key: torch.from_numpy(value).float() for key, value in raw.items() if key != NEXT_REWARD}
-    if not policy.low_dim_keys:  # LeRobot's steps insist on an observation; pictures are decoded below
-        vectors[policy.view_keys[0]] = torch.zeros(1, 3, 1, 1)
-    prepared = agent.prepare(vectors)
-    low_dim, action = agent.low_dim(prepared), prepared[ACTION].cpu().numpy()
-    episodes = []
-    ids = np.unique(numbers)
-    for count, number in enumerate(ids):
-        rows = np.flatnonzero(numbers == number)
-        reward = raw[NEXT_REWARD][rows].reshape(-1) if rewarded else np.zeros(len(rows), np.float32)
+        found = dataset_to_policy_features(dataset.features)
+        for key, feature in {**(policy.config.input_features or {}), ACTION: policy.config.action_feature}.items():
+            if tuple(found[key].shape) != tuple(feature.shape):
+                raise DataError(
+                    f"'{key}' has shape {tuple(found[key].shape)} in the dataset, but {tuple(feature.shape)} in the "
+                    "policy: train a new policy, or give the dataset this one was trained on."
+                )
+        rewarded = NEXT_REWARD in dataset.features
+        columns = dataset.hf_dataset.with_format("numpy")
+        numbers = np.asarray(columns["episode_index"])
+        raw = {
+            key: _column(columns, key) for key in (*policy.low_dim_keys, ACTION, *([NEXT_REWARD] if rewarded else []))
+        }
+        _check_finite(raw, numbers)
         if not rewarded:
-            reward[-1] = 1.0
-        success = bool((reward > 0).any())
-        if success:  # demonstrations end at the first success
-            rows = rows[: int(np.argmax(reward > 0)) + 1]
-        observed = np.append(rows, rows[-1])
-        pixels = tuple(view[np.append(np.arange(len(rows)), len(rows) - 1)] for view in _decode(dataset, agent, rows))
-        episodes.append(
-            Episode(
-                None if low_dim is None else low_dim[observed],
-                pixels,
-                action[rows].clip(-1, 1),
-                reward[: len(rows)].astype(np.float32),
-                success,
-                success,
+            logger.warning("No '%s' column: the last step of each episode counts as the success.", NEXT_REWARD)
+        vectors = {key: torch.from_numpy(value).float() for key, value in raw.items() if key != NEXT_REWARD}
+        if not policy.low_dim_keys:  # LeRobot's steps insist on an observation; pictures are decoded below
+            vectors[policy.view_keys[0]] = torch.zeros(1, 3, 1, 1)
+        prepared = agent.prepare(vectors)
+        low_dim, action = agent.low_dim(prepared), prepared[ACTION].cpu().numpy()
+        episodes = []
+        ids = np.unique(numbers)
+        for count, number in enumerate(ids):
+            rows = np.flatnonzero(numbers == number)
+            reward = raw[NEXT_REWARD][rows].reshape(-1) if rewarded else np.zeros(len(rows), np.float32)
+            if not rewarded:
+                reward[-1] = 1.0
+            success = bool((reward > 0).any())
+            if success:  # demonstrations end at the first success
+                rows = rows[: int(np.argmax(reward > 0)) + 1]
+            observed = np.append(rows, rows[-1])
+            pixels = tuple(
+                view[np.append(np.arange(len(rows)), len(rows) - 1)] for view in _decode(dataset, agent, rows)
             )
-        )
-        on_episode(count + 1, len(ids))
-    return episodes
+            episodes.append(
+                Episode(
+                    low_dim=None if low_dim is None else low_dim[observed],
+                    pixels=pixels,
+                    action=action[rows].clip(-1, 1),
+                    reward=reward[: len(rows)].astype(np.float32),
+                    terminated=success,
+                    success=success,
+                )
+            )
+            on_episode(count + 1, len(ids))
+        return episodes
 
 
 def _column(columns: Any, key: str) -> NDArray[Any]:

@@ -22,7 +22,7 @@ from lerobot_cqn.errors import DataError
 __all__ = ["Journal", "Place", "Rows"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Place:
     """Where an episode of T steps lies, and what it is.
 

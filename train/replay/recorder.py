@@ -29,19 +29,19 @@ class Recorder:
         """Steps so far."""
         return len(self.action)
 
-    def observe(self, prepared: Frame) -> None:
-        """Keep a prepared frame."""
+    def observe(self, prepared: Frame, given: Frame) -> None:
+        """Keep a frame; given: as the environment gave it, before it was prepared."""
         low_dim = self.agent.low_dim(prepared)
         if low_dim is not None:
             self.low_dim.append(low_dim)
-        self.pixels.append(self.agent.pixels(prepared))
+        self.pixels.append(self.agent.pixels(prepared, given))
 
-    def retake(self, prepared: Frame, reward: float) -> None:
+    def retake(self, prepared: Frame, given: Frame, reward: float) -> None:
         """Keep a frame in place of the last one, and a reward for the step that led to it."""
         if self.low_dim:
             self.low_dim.pop()
         self.pixels.pop()
-        self.observe(prepared)
+        self.observe(prepared, given)
         if self.reward:
             self.reward[-1] += reward
 
@@ -54,13 +54,13 @@ class Recorder:
     def episode(self, *, terminated: bool, success: bool) -> Episode:
         """The finished episode."""
         return Episode(
-            np.concatenate(self.low_dim).astype(np.float32) if self.low_dim else None,
-            tuple(np.concatenate(view) for view in zip(*self.pixels, strict=True)) if self.pixels[0] else (),
-            np.stack(self.action).astype(np.float32),
-            np.asarray(self.reward, dtype=np.float32),
-            terminated,
-            success,
-            _spans(self.taught),
+            low_dim=np.concatenate(self.low_dim).astype(np.float32) if self.low_dim else None,
+            pixels=tuple(np.concatenate(view) for view in zip(*self.pixels, strict=True)) if self.pixels[0] else (),
+            action=np.stack(self.action).astype(np.float32),
+            reward=np.asarray(self.reward, dtype=np.float32),
+            terminated=terminated,
+            success=success,
+            taught=_spans(self.taught),
         )
 
 

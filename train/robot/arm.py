@@ -96,11 +96,11 @@ class Arm:
                     self.leader.disconnect()
 
     def frame(self, reading: Reading) -> Frame:
-        """A reading as an observation: state [1, P], pictures float [1, 3, H, W] in 0..1."""
+        """A reading as an observation: state [1, P], pictures uint8 [1, 3, H, W]."""
         state = torch.tensor([[float(reading.raw[name]) for name in self._states]], dtype=torch.float32)
         frame: Frame = {OBS_STATE: state}
         for name, picture in reading.pictures.items():
-            frame[f"{OBS_IMAGES}.{name}"] = torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255
+            frame[f"{OBS_IMAGES}.{name}"] = torch.from_numpy(picture).permute(2, 0, 1)[None].contiguous()
         return frame
 
     # -- the leader ------------------------------------------------------------------------------------------

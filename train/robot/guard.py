@@ -49,7 +49,7 @@ class GuardSettings:
     slow_s: float = 1.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Reading:
     """One observation: joints [D] in the robot's units, pictures by name, everything the robot gave, and when."""
 
@@ -150,7 +150,7 @@ class Guard:
             self._measured, self._trusted, self._read_at = joints, True, now
             if self._goal is None:
                 self._goal = joints
-        return Reading(joints, pictures, raw, now)
+        return Reading(joints=joints, pictures=pictures, raw=raw, at=now)
 
     def _check_fresh(self, joints: Array, pictures: Mapping[str, NDArray[np.uint8]], now: float) -> None:
         """What does not change at all has not been measured: noise alone makes real readings differ."""

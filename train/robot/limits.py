@@ -1,6 +1,6 @@
 """Safety limits as pure functions: from a wanted goal to one that may be sent. Units are the robot's own."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 Forward = Callable[[Array], Array]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Limits:
     """What a goal must keep to; each array is [D], one value a joint in the robot's units.
 
@@ -40,20 +40,6 @@ class Limits:
             raise ConfigError(f"max_step and max_speed must be positive, got {self.max_step} and {self.max_speed}.")
         if self.box is not None and self.forward is None:
             raise ConfigError("A workspace box needs the arm's kinematics: give them, or leave out the box.")
-
-    @classmethod
-    def from_ranges(
-        cls, names: tuple[str, ...], ranges: Mapping[str, tuple[float, float]], step_share: float, speed_share: float
-    ) -> "Limits":
-        """Limits from each joint's range: a step of `step_share` and `speed_share` of it a second.
-
-        Raises ConfigError for a joint without a range.
-        """
-        missing = [name for name in names if name not in ranges]
-        if missing:
-            raise ConfigError(f"No limits for the joint '{missing[0]}': expected one range for each of {list(names)}.")
-        low, high = (np.array([ranges[name][i] for name in names], dtype=np.float64) for i in (0, 1))
-        return cls(low, high, step_share * (high - low), speed_share * (high - low))
 
 
 @dataclass(frozen=True)

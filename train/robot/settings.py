@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 from lerobot_cqn.errors import ConfigError, one_of
+from lerobot_cqn.ranges import check_ranges, number
 
 __all__ = ["ArmSettings"]
 
@@ -11,30 +12,28 @@ __all__ = ["ArmSettings"]
 class ArmSettings:
     """The arm of `--robot.type`: its rate, its limits, what an episode is. Joints are in the robot's own units."""
 
-    fps: int | None = None  # control steps a second; None: the dataset's
-    episode_s: float = 30.0  # seconds until an episode is cut off and its label is waited for
-    joint_margin: float = 0.05  # goals may go so far beyond the joints of the demonstrations, a share of their range
+    fps: int | None = number(None, least=1, most=1000)  # control steps a second; None: the dataset's
+    # seconds until an episode is cut off and its label is waited for
+    episode_s: float = number(30.0, least=0.1, most=3600)
+    # goals may go so far beyond the joints of the demonstrations, a share of their range
+    joint_margin: float = number(0.05, least=0, most=1)
     joint_limits: dict[str, list[float]] = field(default_factory=dict)  # [low, high] of a joint, instead of that
-    step_factor: float = 1.5  # largest distance of a goal from the arm, and speed, over the largest in demonstrations
+    # largest distance of a goal from the arm, and speed, over the largest in demonstrations
+    step_factor: float = number(1.5, least=0.1, most=100)
     workspace: list[float] | None = None  # box of the tip, m: x_low, x_high, y_low, y_high, z_low, z_high
     urdf: str = ""  # of the arm, for the workspace (needs the placo package), where the robot has no `tip_position`
     tip: str = "gripper_frame_link"  # frame of the URDF that stays in the workspace
     go_home: bool = True  # after each episode, to where the demonstrations start
     home: dict[str, float] = field(default_factory=dict)  # joints of home; left out ones as in the demonstrations
-    home_speed: float = 0.3  # share of the largest speed, (0, 1]
+    home_speed: float = number(0.3, least=0.001, most=1)  # share of the largest speed, (0, 1]
     on_exit: str = "hold"  # or "release": the motors go off, and the arm may fall
-    stale_s: float = 1.0  # seconds after which a picture or joint that never changes is a fault
-    watchdog_s: float = 0.5  # seconds without a goal after which the arm is held
+    # seconds after which a picture or joint that never changes is a fault
+    stale_s: float = number(1.0, least=0.05, most=60)
+    watchdog_s: float = number(0.5, least=0.05, most=10)  # seconds without a goal after which the arm is held
 
     def validate(self) -> None:
         """Raises ConfigError for values out of range."""
-        for name, low, high in (
-            ("fps", 1, 1000), ("episode_s", 0.1, 3600), ("joint_margin", 0, 1), ("step_factor", 0.1, 100),
-            ("home_speed", 0.001, 1), ("stale_s", 0.05, 60), ("watchdog_s", 0.05, 10),
-        ):  # fmt: skip
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise ConfigError(f"`arm.{name}` must be {low:g} to {high:g}, got {value}.")
+        check_ranges(self, "arm.")
         for joint, pair in self.joint_limits.items():
             if len(pair) != 2 or not pair[0] < pair[1]:
                 raise ConfigError(f"`arm.joint_limits` of '{joint}' must be [low, high], got {pair}.")

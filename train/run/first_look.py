@@ -122,9 +122,13 @@ def _rows(batch: Batch, chosen: NDArray[Any]) -> Batch:
         return Observation(tuple(v[index] for v in o.pixels), None if o.low_dim is None else o.low_dim[index])
 
     return Batch(
-        observation(batch.observation), batch.action[index], batch.reward[index], batch.discount[index],
-        observation(batch.next_observation), batch.demo[index],
-    )  # fmt: skip
+        observation=observation(batch.observation),
+        action=batch.action[index],
+        reward=batch.reward[index],
+        discount=batch.discount[index],
+        next_observation=observation(batch.next_observation),
+        demo=batch.demo[index],
+    )
 
 
 def _bars(draw: ImageDraw.ImageDraw, values: NDArray[Any], left: int, top: int) -> None:

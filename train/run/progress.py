@@ -3,7 +3,7 @@
 import time
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 from rich.console import Console
 from rich.progress import (
@@ -15,6 +15,8 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+from ..interfaces import Monitor
 
 __all__ = ["ConsoleMonitor", "Monitors"]
 
@@ -80,7 +82,7 @@ class ConsoleMonitor:
 class Monitors:
     """Several places that show the same progress."""
 
-    def __init__(self, monitors: Sequence[Any]) -> None:
+    def __init__(self, monitors: Sequence[Monitor]) -> None:
         self.monitors = monitors
 
     def phase(self, name: str, total: int, done: int) -> None:

@@ -29,7 +29,17 @@ replay = Replay(config.settings.frame_stack, config.settings.n_step, config.sett
 rng = np.random.default_rng(0)
 state = rng.normal(size=(9, 2)).astype(np.float32)
 action = rng.uniform(-1, 1, (8, 2)).astype(np.float32)
-replay.add(Episode(state, (), action, np.eye(1, 8, 7, dtype=np.float32)[0], True, True), demo=True)
+replay.add(
+    Episode(
+        low_dim=state,
+        pixels=(),
+        action=action,
+        reward=np.eye(1, 8, 7, dtype=np.float32)[0],
+        terminated=True,
+        success=True,
+    ),
+    demo=True,
+)
 
 before = [parameter.clone() for parameter in policy.parameters()]
 Learner(policy.model).update(replay.sample(4, 4, rng))

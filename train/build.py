@@ -1,0 +1,254 @@
+"""The composition root: a checked run becomes a trainer with all its parts. Nothing else puts them together."""
+
+import contextlib
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import draccus
+import numpy as np
+import torch
+from lerobot.envs.configs import EnvConfig
+from lerobot.policies.factory import get_policy_class, make_policy, make_pre_post_processors
+from lerobot.robots.config import RobotConfig
+from lerobot.utils.constants import ACTION, OBS_STATE
+
+from lerobot_cqn.errors import ConfigError, OutputExistsError
+from lerobot_cqn.joint_goals import converted_deltas
+from lerobot_cqn.learner import Learner
+
+from .agent import Agent
+from .arm.build import make_operated, recall, steering
+from .config import ValidRun
+from .interfaces import Environment, Monitor, Nobody, Person, Scenes
+from .loop.gym_env import GymEnvironment, GymScenes, OneScene, check_fits
+from .loop.trainer import Trainer
+from .operator.board import Board
+from .push.cli import check_account
+from .replay.buffer import Episode, Replay
+from .replay.demonstrations import Demonstrations
+from .run.checkpoint import Counters, last_checkpoint, restore, save, seed_everything
+from .run.first_look import draw_batch, warnings_about
+from .run.metrics import Log, Metrics, start_tensorboard, start_wandb
+from .run.progress import Monitors
+
+__all__ = ["build"]
+
+Bounds = Mapping[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """What is acted in, to learn and to evaluate, and the person beside it.
+
+    bounds: `min` and `max` [D] of the environment's action, None where it has none; board: what the person is shown.
+    """
+
+    env: Environment
+    scenes: Scenes
+    agent: Agent
+    person: Person
+    bounds: Bounds | None = None
+    board: Board | None = None
+
+
+def build(run: ValidRun, monitor: Monitor, should_stop: Callable[[], bool], stack: contextlib.ExitStack) -> Trainer:
+    """Every part of a run, put together. Raises CQNError before any work is done.
+
+    stack: takes up what must be closed again.
+    """
+    config = run.config
+    check_outside(run, monitor.message)
+    checkpoint = last_checkpoint(run.output_dir) if config.resume else None
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    rng = seed_everything(config.seed)
+    data = Demonstrations(config.dataset) if config.dataset.repo_id else None
+    if isinstance(run.acts_in, EnvConfig):
+        world = make_simulation(run.acts_in, run, checkpoint, data, stack)
+    else:
+        world = make_arm(run.acts_in, run, checkpoint, data, monitor.message, should_stop, stack)
+    agent, replay = world.agent, make_replay(run)
+    with nothing_left(None if config.resume else run.output_dir):
+        load_demonstrations(run, data, world, replay, monitor)
+        finished = replay.reopen() if checkpoint is not None else []
+    run.output_dir.mkdir(parents=True, exist_ok=True)
+    if checkpoint is None and replay.episodes:
+        picture = run.output_dir / "first_batch.png"
+        sizes = (256, 256 if replay.demonstrations else 0)  # enough to have a reward among them
+        draw_batch(replay.sample(*sizes, np.random.default_rng(config.seed)), picture)
+        monitor.message(f"First batch: {picture}")
+    metrics = Metrics(run.output_dir, also_to(run, world.board))
+    learner, counters = Learner(agent.policy.model), Counters()
+    if checkpoint is not None:
+        counters, tables = restore(checkpoint, learner, rng)
+        metrics.truncate(tables)
+        finished = [place for place in finished if place.number >= counters.episodes]
+        monitor.message(f"Resuming at step {counters.env_steps}, {counters.updates} updates.")
+
+    def save_checkpoint() -> None:
+        save(
+            run.output_dir, agent, learner, rng, counters, tables=metrics.sizes(), run_config=draccus.encode(config),
+        )  # fmt: skip
+
+    if world.board is not None:
+        recall(world.board, run.output_dir)
+        monitor = Monitors([monitor, world.board])
+    return Trainer(
+        config=config, agent=agent, learner=learner, env=world.env, scenes=world.scenes, replay=replay,
+        metrics=metrics, monitor=monitor, rng=rng, counters=counters, save=save_checkpoint, should_stop=should_stop,
+        finished_since=finished, person=world.person,
+    )  # fmt: skip
+
+
+def check_outside(run: ValidRun, say: Callable[[str], None]) -> None:
+    """Make sure of the output folder and the Hub account, before anything is made. Raises CQNError; says warnings."""
+    if not run.config.resume and run.output_dir.exists() and any(run.output_dir.iterdir()):
+        raise OutputExistsError(
+            f"{run.output_dir} exists and is not empty: give another --output_dir, or --resume=true to continue."
+        )
+    if run.policy.push_to_hub and (warning := check_account(str(run.policy.repo_id))):
+        say(f"Warning: {warning}")
+
+
+# -- the world -----------------------------------------------------------------------------------------------
+
+
+def make_simulation(
+    env_config: EnvConfig,
+    run: ValidRun,
+    checkpoint: Path | None,
+    data: Demonstrations | None,
+    stack: contextlib.ExitStack,
+) -> World:
+    """A simulated environment, which judges for itself; several evaluate at a time where that is asked for."""
+    evaluation = run.config.eval
+    gym = GymEnvironment(env_config, run.policy)
+    bounds = gym.action_bounds()
+    agent = make_agent(run, checkpoint, data, bounds)
+    check_fits(env_config, agent.policy, "policy" if run.config.continues else "dataset")
+    scenes: Scenes = OneScene(gym)
+    if evaluation.batch_size > 1:
+        scenes = GymScenes(env_config, run.policy, evaluation.batch_size, apart=evaluation.use_async_envs)
+    stack.callback(gym.close)
+    stack.callback(scenes.close)
+    return World(env=gym, scenes=scenes, agent=agent, person=Nobody(), bounds=bounds)
+
+
+def make_arm(
+    robot_config: RobotConfig,
+    run: ValidRun,
+    checkpoint: Path | None,
+    data: Demonstrations | None,
+    say: Callable[[str], None],
+    should_stop: Callable[[], bool],
+    stack: contextlib.ExitStack,
+) -> World:
+    """An arm with its person at the page or at keys; it is the only scene of evaluations, too."""
+    agent = make_agent(run, checkpoint, data, None)
+    operated = make_operated(robot_config, run.config, agent, data, should_stop, say)
+    stack.enter_context(steering(run.config, operated, say))  # before anything is written: the port may be taken
+    stack.callback(operated.env.close)
+    stack.callback(lambda: say(operated.env.summary()) if operated.env.summary() else None)
+    scenes = OneScene(operated.env)
+    return World(env=operated.env, scenes=scenes, agent=agent, person=operated.session, board=operated.board)
+
+
+# -- the policy ----------------------------------------------------------------------------------------------
+
+
+def make_agent(run: ValidRun, checkpoint: Path | None, data: Demonstrations | None, env_bounds: Bounds | None) -> Agent:
+    """Policy and processors: new ones from the dataset's statistics, or those of a checkpoint or trained policy.
+
+    Without a dataset the features are the environment's and the state stays as it is.
+    """
+    pretrained = checkpoint / "pretrained_model" if checkpoint is not None else run.policy.pretrained_path
+    agent = trained_agent(run, Path(pretrained)) if pretrained is not None else new_agent(run, data, env_bounds)
+    agent.policy.train()
+    return agent
+
+
+def trained_agent(run: ValidRun, folder: Path) -> Agent:
+    """The policy in a folder. Raises ConfigError where its weights do not fit the settings."""
+    try:
+        policy: Any = get_policy_class(run.policy.type).from_pretrained(folder, config=run.policy)
+    except RuntimeError as error:  # torch names every tensor that differs
+        raise ConfigError(
+            f"The weights in {folder} do not fit: leave out the --policy.* settings that change the network "
+            "(sizes, levels, bins, atoms, frame_stack), or start anew."
+        ) from error
+    return Agent(policy, *make_pre_post_processors(run.policy, pretrained_path=str(folder)))
+
+
+def new_agent(run: ValidRun, data: Demonstrations | None, env_bounds: Bounds | None) -> Agent:
+    """A policy with new weights, its actions bounded as the recipe says. Raises ConfigError where that cannot be."""
+    meta = data.meta if data is not None else None
+    if meta is None and not isinstance(run.acts_in, EnvConfig):
+        raise ConfigError("An arm needs demonstrations, or a policy that was trained on some: give --dataset.repo_id.")
+    source: dict[str, Any] = {"env_cfg": run.acts_in} if meta is None else {"ds_meta": meta}
+    policy: Any = make_policy(run.policy, **source)
+    stats: dict[str, Any] = {} if meta is None else dict(meta.stats or {})
+    if run.config.recipe.action_bounds == "environment":
+        if meta is not None and converted_deltas(meta) is not None:
+            raise ConfigError(
+                "The dataset's actions are differences, the environment bounds goals: give --action_bounds=data."
+            )
+        if env_bounds is None:
+            raise ConfigError("The environment bounds no action: give --action_bounds=data and a dataset.")
+        stats[ACTION] = env_bounds
+    return Agent(policy, *make_pre_post_processors(run.policy, dataset_stats=stats, dataset_meta=meta))
+
+
+# -- the run's folder ----------------------------------------------------------------------------------------
+
+
+def make_replay(run: ValidRun) -> Replay:
+    """An empty replay in the run's folder."""
+    s, replay = run.policy.settings, run.config.replay
+    return Replay(
+        s.frame_stack, s.n_step, s.discount, folder=run.output_dir / "replay", capacity_gib=replay.capacity_gib,
+        by_step=replay.sampling == "steps",
+    )  # fmt: skip
+
+
+def load_demonstrations(
+    run: ValidRun, data: Demonstrations | None, world: World, replay: Replay, monitor: Monitor
+) -> None:
+    """Fill the replay with the dataset, and say what about it makes learning hard."""
+    shown: list[Episode] = []
+    if data is not None:
+        monitor.phase("load", 1, 0)
+        for episode in data.episodes(world.agent, lambda i, n: monitor.advance(i, f"episode {i}/{n}")):
+            replay.add_demonstration(episode)
+            shown.append(replace(episode, pixels=()))
+    state = run.policy.low_dim_features.get(OBS_STATE)
+    joints = state.shape[0] if state is not None else 0
+    for sentence in warnings_about(shown, free=world.agent.inside(world.bounds), joints=joints):
+        monitor.message(f"Warning: {sentence}")
+
+
+def also_to(run: ValidRun, board: Board | None) -> list[Log]:
+    """Where metrics go besides their files."""
+    config = run.config
+    also: list[Log] = [] if board is None else [board.log]
+    if config.tensorboard:
+        also.append(start_tensorboard(run.output_dir / "tensorboard"))
+    if config.wandb.enable:
+        run_config = draccus.encode(config)
+        also.append(start_wandb(config.wandb.project, run.output_dir.name, run_config, config.wandb.mode))
+    return also
+
+
+@contextlib.contextmanager
+def nothing_left(folder: Path | None) -> Iterator[None]:
+    """Remove the new run's folder when its beginning fails, so that the same command can be given again."""
+    try:
+        yield
+    except BaseException:
+        if folder is not None:
+            shutil.rmtree(folder / "replay", ignore_errors=True)
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
