@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from cqn_train.replay.buffer import Episode, Replay
+from cqn_train.replay.buffer import Replay
+from cqn_train.replay.episode import Episode
 
 from .results_table import append
 

@@ -27,8 +27,9 @@ from .loop.gym_env import GymEnvironment, GymScenes, OneScene, check_fits
 from .loop.trainer import Trainer
 from .operator.board import Board
 from .push.cli import check_account
-from .replay.buffer import Episode, Replay
+from .replay.buffer import Replay
 from .replay.demonstrations import Demonstrations
+from .replay.episode import Episode
 from .run.checkpoint import Counters, last_checkpoint, restore, save, seed_everything
 from .run.first_look import draw_batch, warnings_about
 from .run.metrics import Log, Metrics, start_tensorboard, start_wandb

@@ -13,7 +13,8 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from safetensors.torch import load_file
 
 from cqn_train.agent import Agent
-from cqn_train.replay.buffer import Episode, Replay
+from cqn_train.replay.buffer import Replay
+from cqn_train.replay.episode import Episode
 from cqn_train.run.checkpoint import Counters, last_checkpoint, restore, save
 from lerobot_cqn.configuration_cqn import CQNConfig
 from lerobot_cqn.errors import DataError

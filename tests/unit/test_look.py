@@ -7,7 +7,8 @@ import pytest
 import torch
 from PIL import Image
 
-from cqn_train.replay.buffer import Episode, Replay
+from cqn_train.replay.buffer import Replay
+from cqn_train.replay.episode import Episode
 from cqn_train.run.first_look import draw_batch, save_batch, warnings_about
 
 

@@ -9,7 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cqn_train.replay.buffer import Episode, Replay
+from cqn_train.replay.buffer import Replay
+from cqn_train.replay.episode import Episode
 from lerobot_cqn.errors import DataError
 from lerobot_cqn.schema import Batch
 

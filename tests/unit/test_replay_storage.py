@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cqn_train.replay import buffer as replay_module
-from cqn_train.replay.buffer import Episode, Replay
+from cqn_train.replay.buffer import Replay
+from cqn_train.replay.episode import Episode
 from cqn_train.replay.files import Journal, Place
 from lerobot_cqn.errors import ConfigError, DataError
 from lerobot_cqn.schema import Batch

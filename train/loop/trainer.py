@@ -15,7 +15,8 @@ from lerobot_cqn.schema import Batch
 from ..agent import Agent
 from ..config import RunConfig
 from ..interfaces import Environment, Interrupted, Label, Monitor, Outcome, Person, Scenes
-from ..replay.buffer import Episode, Replay
+from ..replay.buffer import Replay
+from ..replay.episode import Episode
 from ..replay.files import Place
 from ..replay.recorder import Recorder
 from ..run.checkpoint import Counters

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,44 +14,14 @@ from numpy.typing import NDArray
 from lerobot_cqn.errors import ConfigError, DataError
 from lerobot_cqn.schema import Batch, Observation
 
+from .episode import Episode
 from .files import Journal, Place, Rows
 
-__all__ = ["Episode", "Replay"]
+__all__ = ["Replay"]
 
 GIB = 2**30
 BATCHES = 4  # whose pictures are in memory at a time
 SAMPLED = [("start", int), ("length", int), ("terminated", bool), ("demo", bool), ("first", int), ("last", int)]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Episode:
-    """One episode of T steps and T + 1 observations.
-
-    low_dim: float32 [T + 1, P], normalised (None without state); pixels: per view uint8 [T + 1, 3, H, W];
-    action: float32 [T, D] in [-1, 1]; reward: float32 [T].
-    terminated: the last step really ended the task (success); otherwise time ran out and the last
-    observation's value still counts. taught: the steps (first, one past the last) that a person drove.
-    """
-
-    low_dim: NDArray[Any] | None
-    pixels: tuple[NDArray[Any], ...]
-    action: NDArray[Any]
-    reward: NDArray[Any]
-    terminated: bool
-    success: bool
-    taught: tuple[tuple[int, int], ...] = ()
-
-    def __len__(self) -> int:
-        """Steps, T."""
-        return len(self.action)
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """What is stored, T + 1 rows each: a row of its own for the last observation keeps one index for all."""
-        state = self.low_dim if self.low_dim is not None else np.zeros((len(self) + 1, 0), np.float32)
-        rows = {"low_dim": state.astype(np.float32)}
-        for name, values in (("action", self.action), ("reward", self.reward)):
-            rows[name] = np.concatenate([values, np.zeros_like(values[:1])]).astype(np.float32)
-        return rows | {f"view_{i}": view for i, view in enumerate(self.pixels)}
 
 
 class Replay:

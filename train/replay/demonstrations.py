@@ -19,7 +19,7 @@ from lerobot_cqn.schema import NEXT_REWARD
 
 from ..agent import Agent
 from ..config import DatasetSettings
-from .buffer import Episode
+from .episode import Episode
 
 __all__ = ["Demonstrations", "load_metadata"]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..agent import Agent
 from ..interfaces import Frame
-from .buffer import Episode
+from .episode import Episode
 
 __all__ = ["Recorder"]
 

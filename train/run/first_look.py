@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw
 from cqn_data.decisions.pause_threshold import suggest
 from lerobot_cqn.schema import Batch, Observation
 
-from ..replay.buffer import Episode
+from ..replay.episode import Episode
 
 __all__ = ["draw_batch", "save_batch", "warnings_about", "write_films"]
 

@@ -12,7 +12,8 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 register_third_party_plugins()
 
-from cqn_train.replay.buffer import Episode, Replay  # noqa: E402
+from cqn_train.replay.buffer import Replay  # noqa: E402
+from cqn_train.replay.episode import Episode  # noqa: E402
 from lerobot_cqn.configuration_cqn import CQNConfig  # noqa: E402
 from lerobot_cqn.learner import Learner  # noqa: E402
 from lerobot_cqn.modeling_cqn import CQNPolicy  # noqa: E402
