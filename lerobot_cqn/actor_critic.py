@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .distributional import project
+from .distributional import project_onto_support
 from .losses import demo_mean
 from .model import Features, Model
 from .networks import initialise, projection
@@ -156,7 +156,7 @@ class DrQv2Model(Model):
         logits = logits[torch.arange(len(logits), device=logits.device), lower]  # [B, A]
         if not self.settings.distributional:
             return reward + discount * logits
-        return project(F.softmax(logits, dim=-1)[:, None], reward, discount, self.support)[:, 0]
+        return project_onto_support(F.softmax(logits, dim=-1)[:, None], reward, discount, self.support)[:, 0]
 
     def _actor_loss(self, features: Features, mean: Tensor) -> Tensor:
         """Minus the lower value of a noisy action; the gradient passes through the critic to the actor only."""

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .distributional import expectation, project
+from .distributional import expectation, project_onto_support
 from .intervals import decode, encode, previous_centres, snap, zoom
 from .losses import (
     demo_mean,
@@ -18,7 +18,7 @@ from .losses import (
     take_bin,
 )
 from .model import Features, Model
-from .networks import CoarseToFineNetwork, Projected, initialise, zero_head
+from .networks import CoarseToFineNetwork, NetworkShape, Precomputed, initialise, zero_head
 from .schema import Batch, Observation
 from .settings import CQNSettings
 
@@ -38,11 +38,12 @@ class CQNModel(Model):
         self, views: Mapping[str, tuple[int, int, int]], low_dim_size: int, dims: int, settings: CQNSettings
     ) -> None:
         super().__init__(views, settings, plain=False)
-        low_dim_size *= settings.frame_stack
-        sizes = (self.pixel_size, low_dim_size, settings.feature_dim, settings.hidden_dim, dims)
-        shape = (settings.levels, settings.bins, settings.critic_atoms)
-        self.critic = CoarseToFineNetwork(*sizes, *shape)
-        self.target_critic = CoarseToFineNetwork(*sizes, *shape)
+        shape = NetworkShape(
+            pixel_size=self.pixel_size, low_dim_size=low_dim_size * settings.frame_stack,
+            feature_dim=settings.feature_dim, hidden_dim=settings.hidden_dim, dims=dims, levels=settings.levels,
+            bins=settings.bins, atoms=settings.critic_atoms,
+        )  # fmt: skip
+        self.critic, self.target_critic = CoarseToFineNetwork(shape), CoarseToFineNetwork(shape)
         initialise(self)
         zero_head(self.critic.advantage)
         zero_head(self.critic.value)
@@ -55,36 +56,36 @@ class CQNModel(Model):
 
     # -- values --------------------------------------------------------------------------------------------
 
-    def project(self, critic: CoarseToFineNetwork, features: Features) -> Projected:
+    def precompute(self, critic: CoarseToFineNetwork, features: Features) -> Precomputed:
         """First layers of a critic, once per observation."""
         with self.autocast():
-            projected: Projected = critic.project(*features)
-        return projected
+            precomputed: Precomputed = critic.precompute(*features)
+        return precomputed
 
-    def evaluate(self, critic: CoarseToFineNetwork, projected: Projected, indices: Tensor) -> Tensor:
+    def evaluate(self, critic: CoarseToFineNetwork, precomputed: Precomputed, indices: Tensor) -> Tensor:
         """Logits along a known path, all levels in one pass: indices [B, L, D] -> [B, L, D, N, A]."""
         previous = previous_centres(indices, self.settings.bins)
         levels = torch.arange(self.settings.levels, device=indices.device)
         with self.autocast():
-            logits: Tensor = critic(projected, previous, levels)
+            logits: Tensor = critic(precomputed, previous, levels)
         return logits
 
     @torch.no_grad()
     def greedy(
-        self, critic: CoarseToFineNetwork, projected: Projected, random_below: float = 0.0
+        self, critic: CoarseToFineNetwork, precomputed: Precomputed, random_below: float = 0.0
     ) -> tuple[Tensor, Tensor]:
         """Algorithm 1 without input actions: indices [B, L, D] and the mean Q of the chosen bins [B].
 
         random_below: where Q spreads less than this over the bins, a random bin is taken (0: never).
         """
         s = self.settings
-        low = torch.full((projected.value.shape[0], critic.dims), -1.0, device=projected.value.device)
+        low = torch.full((precomputed.value.shape[0], critic.shape.dims), -1.0, device=precomputed.value.device)
         high = -low
         indices, chosen = [], []
         for level in range(s.levels):
-            centre = (low + high) / 2 if level else torch.zeros_like(low)
+            centre = (low + high) / 2
             with self.autocast():
-                logits = critic(projected, centre[:, None], torch.tensor([level], device=low.device))
+                logits = critic(precomputed, centre[:, None], torch.tensor([level], device=low.device))
             q = self.q_values(logits[:, 0])  # [B, D, N]
             index = q.argmax(-1)
             if random_below > 0:
@@ -103,8 +104,8 @@ class CQNModel(Model):
         """
         s = self.settings
         critic = self.target_critic if s.act_with == "target" else self.critic
-        projected = self.project(critic, self.encode(observation))
-        indices, q = self.greedy(critic, projected, s.random_bin_below if explore else 0.0)
+        precomputed = self.precompute(critic, self.encode(observation))
+        indices, q = self.greedy(critic, precomputed, s.random_bin_below if explore else 0.0)
         action = decode(indices, s.bins)
         if explore and s.exploration_noise > 0:
             action = snap(action + s.exploration_noise * torch.randn_like(action), s.levels, s.bins)
@@ -120,22 +121,22 @@ class CQNModel(Model):
         that same path (the authors' implementation); `next_action_from="target"` is equation 2 as written.
         """
         s = self.settings
-        target = self.project(self.target_critic, next_features)
+        target = self.precompute(self.target_critic, next_features)
         if s.next_action_from == "online":
-            path, _ = self.greedy(self.critic, self.project(self.critic, next_features))
+            path, _ = self.greedy(self.critic, self.precompute(self.critic, next_features))
         else:
             path, _ = self.greedy(self.target_critic, target)
         logits = take_bin(self.evaluate(self.target_critic, target, path), path)[..., 0, :]  # [B, L, D, A]
         if not s.distributional:
             return reward[..., None] + discount[..., None] * logits[..., 0]
-        return project(F.softmax(logits, dim=-1), reward, discount, self.support)
+        return project_onto_support(F.softmax(logits, dim=-1), reward, discount, self.support)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of Algorithm 2 and its parts (detached scalars) for an already augmented batch."""
         s = self.settings
-        projected = self.project(self.critic, self.encode(batch.observation))
+        precomputed = self.precompute(self.critic, self.encode(batch.observation))
         indices = encode(batch.action, s.levels, s.bins)
-        logits = self.evaluate(self.critic, projected, indices)
+        logits = self.evaluate(self.critic, precomputed, indices)
         total = logits.new_zeros(())
         stats: dict[str, Tensor] = {}
         if s.rl_loss_scale > 0:

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-__all__ = ["expectation", "project", "support"]
+__all__ = ["expectation", "project_onto_support", "support"]
 
 
 def support(v_min: float, v_max: float, atoms: int, device: torch.device | str | None = None) -> Tensor:
@@ -16,7 +16,7 @@ def expectation(probs: Tensor, values: Tensor) -> Tensor:
     return probs @ values
 
 
-def project(probs: Tensor, reward: Tensor, discount: Tensor, values: Tensor) -> Tensor:
+def project_onto_support(probs: Tensor, reward: Tensor, discount: Tensor, values: Tensor) -> Tensor:
     """Distribution of `reward + discount * Z` projected on the fixed support; keeps the probability mass.
 
     probs: [B, ..., A] distribution of Z over `values`; reward, discount: [B, 1]; values: [A], equally spaced.

@@ -1,6 +1,7 @@
 """Encoders, streams and heads (paper, section 3.2 and table 2). Every size is derived from the features."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -10,7 +11,16 @@ from torch import Tensor, nn
 
 from .errors import ConfigError
 
-__all__ = ["CoarseToFineNetwork", "Projected", "Stream", "ViewEncoder", "initialise", "projection", "zero_head"]
+__all__ = [
+    "CoarseToFineNetwork",
+    "NetworkShape",
+    "Precomputed",
+    "Stream",
+    "ViewEncoder",
+    "initialise",
+    "projection",
+    "zero_head",
+]
 
 # Kernel, stride and padding of every convolution (table 2; the kernel is the authors' choice).
 KERNEL, STRIDE, PADDING = 4, 2, 1
@@ -51,7 +61,30 @@ class ViewEncoder(nn.Module):
         return pixels.flatten(1)
 
 
-class Projected(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class NetworkShape:
+    """Sizes of a coarse-to-fine network.
+
+    pixel_size: E, features of all cameras together, 0 without; low_dim_size: S*P values, 0 without; feature_dim: F of
+    each projection; hidden_dim: H of the trunk; dims, levels, bins, atoms: D, L, N, A.
+    """
+
+    pixel_size: int
+    low_dim_size: int
+    feature_dim: int
+    hidden_dim: int
+    dims: int
+    levels: int
+    bins: int
+    atoms: int
+
+    @property
+    def feature_size(self) -> int:
+        """Values of an observation that enter the trunk."""
+        return self.feature_dim * (bool(self.pixel_size) + bool(self.low_dim_size))
+
+
+class Precomputed(NamedTuple):
     """An observation after everything that does not depend on level or action; one [B, H] per stream."""
 
     advantage: Tensor
@@ -69,42 +102,32 @@ class Stream(nn.Module):
     The trunk's input is [pixels F | low-dim F | previous-level action D | one-hot level L].
     """
 
-    def __init__(
-        self,
-        pixel_size: int,
-        low_dim_size: int,
-        feature_dim: int,
-        hidden_dim: int,
-        dims: int,
-        levels: int,
-        out: int,
-    ) -> None:
+    def __init__(self, shape: NetworkShape, out: int) -> None:
         super().__init__()
-        self.pixel_projection = projection(pixel_size, feature_dim) if pixel_size else None
-        self.low_dim_projection = projection(low_dim_size, feature_dim) if low_dim_size else None
-        self.feature_size = feature_dim * (bool(pixel_size) + bool(low_dim_size))
-        self.action_dims = dims
-        self.first = nn.Linear(self.feature_size + dims + levels, hidden_dim, bias=False)
+        self.shape, hidden_dim = shape, shape.hidden_dim
+        self.pixel_projection = projection(shape.pixel_size, shape.feature_dim) if shape.pixel_size else None
+        self.low_dim_projection = projection(shape.low_dim_size, shape.feature_dim) if shape.low_dim_size else None
+        self.first = nn.Linear(shape.feature_size + shape.dims + shape.levels, hidden_dim, bias=False)
         self.first_norm = nn.LayerNorm(hidden_dim, eps=LAYER_NORM_EPS)
         self.second = nn.Linear(hidden_dim, hidden_dim, bias=False)
         self.second_norm = nn.LayerNorm(hidden_dim, eps=LAYER_NORM_EPS)
         self.head = nn.Linear(hidden_dim, out)
 
-    def project(self, pixels: Tensor | None, low_dim: Tensor | None) -> Tensor:
+    def precompute(self, pixels: Tensor | None, low_dim: Tensor | None) -> Tensor:
         """Observation part of the first trunk layer, once per observation: -> [B, H]."""
         parts = []
         if self.pixel_projection is not None:
             parts.append(self.pixel_projection(pixels))
         if self.low_dim_projection is not None:
             parts.append(self.low_dim_projection(low_dim))
-        return F.linear(torch.cat(parts, dim=-1), self.first.weight[:, : self.feature_size])
+        return F.linear(torch.cat(parts, dim=-1), self.first.weight[:, : self.shape.feature_size])
 
-    def forward(self, projected: Tensor, previous: Tensor, levels: Tensor) -> Tensor:
+    def forward(self, precomputed: Tensor, previous: Tensor, levels: Tensor) -> Tensor:
         """[B, H], previous-level action [B, K, D], level numbers int64 [K] -> [B, K, out]."""
-        split = self.feature_size + self.action_dims
+        features, split = self.shape.feature_size, self.shape.feature_size + self.shape.dims
         hidden = (
-            projected[:, None]
-            + F.linear(previous, self.first.weight[:, self.feature_size : split])
+            precomputed[:, None]
+            + F.linear(previous, self.first.weight[:, features:split])
             + self.first.weight[:, split:].T[levels]
         )
         hidden = F.silu(self.first_norm(hidden))
@@ -116,36 +139,25 @@ class Stream(nn.Module):
 class CoarseToFineNetwork(nn.Module):
     """Q-network of equation 1: dueling streams shared by all levels and dimensions."""
 
-    def __init__(
-        self,
-        pixel_size: int,
-        low_dim_size: int,
-        feature_dim: int,
-        hidden_dim: int,
-        dims: int,
-        levels: int,
-        bins: int,
-        atoms: int,
-    ) -> None:
+    def __init__(self, shape: NetworkShape) -> None:
         super().__init__()
-        self.dims, self.levels, self.bins, self.atoms = dims, levels, bins, atoms
-        sizes = (pixel_size, low_dim_size, feature_dim, hidden_dim, dims, levels)
-        self.advantage = Stream(*sizes, dims * bins * atoms)
-        self.value = Stream(*sizes, dims * atoms)
+        self.shape = shape
+        self.advantage = Stream(shape, shape.dims * shape.bins * shape.atoms)
+        self.value = Stream(shape, shape.dims * shape.atoms)
 
-    def project(self, pixels: Tensor | None, low_dim: Tensor | None) -> Projected:
+    def precompute(self, pixels: Tensor | None, low_dim: Tensor | None) -> Precomputed:
         """Pixel features [B, E] or None and low-dim values [B, S*P] or None -> what `forward` starts from."""
-        return Projected(self.advantage.project(pixels, low_dim), self.value.project(pixels, low_dim))
+        return Precomputed(self.advantage.precompute(pixels, low_dim), self.value.precompute(pixels, low_dim))
 
-    def forward(self, projected: Projected, previous: Tensor, levels: Tensor) -> Tensor:
+    def forward(self, precomputed: Precomputed, previous: Tensor, levels: Tensor) -> Tensor:
         """Logits of all bins at K levels: previous [B, K, D], levels [K] -> float32 [B, K, D, N, A]."""
-        batch, count = previous.shape[:2]
-        advantage = self.advantage(projected.advantage, previous, levels).float()
-        value = self.value(projected.value, previous, levels).float()
-        advantage = advantage.view(batch, count, self.dims, self.bins, self.atoms)
-        value = value.view(batch, count, self.dims, 1, self.atoms)
+        (batch, count), s = previous.shape[:2], self.shape
+        advantage = self.advantage(precomputed.advantage, previous, levels).float()
+        value = self.value(precomputed.value, previous, levels).float()
+        advantage = advantage.view(batch, count, s.dims, s.bins, s.atoms)
+        value = value.view(batch, count, s.dims, 1, s.atoms)
         # A sum, then a division of the small result: the gradient of `mean` would be a pass over all logits.
-        logits: Tensor = advantage + (value - advantage.sum(-2, keepdim=True) / self.bins)
+        logits: Tensor = advantage + (value - advantage.sum(-2, keepdim=True) / s.bins)
         return logits
 
 

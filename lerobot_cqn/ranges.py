@@ -12,11 +12,15 @@ __all__ = ["Range", "check_ranges", "number"]
 
 @dataclass(frozen=True, kw_only=True)
 class Range:
-    """Allowed values of a number: from `least` or strictly above `above`, up to `most`; None: no such bound."""
+    """Allowed values of a number: from `least` or strictly above `above`, up to `most`; None: no such bound.
+
+    unit: for a person, e.g. "seconds".
+    """
 
     least: float | None = None
     above: float | None = None
     most: float | None = None
+    unit: str = ""
 
     def holds(self, value: float) -> bool:
         """Whether the value lies in the range; NaN lies in none."""
@@ -27,7 +31,10 @@ class Range:
         )
 
     def __str__(self) -> str:
-        """Words for a person: "at least 1", "in (0, 1]", "0 to 5"."""
+        """Words for a person: "at least 1", "in (0, 1]", "0 to 5 seconds"."""
+        return f"{self._bounds()} {self.unit}".rstrip()
+
+    def _bounds(self) -> str:
         if self.above is not None:
             return f"in ({self.above:g}, {self.most:g}]" if self.most is not None else "positive"
         if self.least is None:
@@ -35,9 +42,9 @@ class Range:
         return f"{self.least:g} to {self.most:g}" if self.most is not None else f"at least {self.least:g}"
 
 
-def number(default: Any, *, least: float | None = None, above: float | None = None, most: float | None = None) -> Any:
-    """Dataclass field with a default and a range, which `check_ranges` keeps; `above` is 0 where it is given."""
-    return dataclasses.field(default=default, metadata={"range": Range(least=least, above=above, most=most)})
+def number(default: Any, **bounds: Any) -> Any:
+    """Dataclass field with a default and a range, which `check_ranges` keeps; bounds: the fields of `Range`."""
+    return dataclasses.field(default=default, metadata={"range": Range(**bounds)})
 
 
 def check_ranges(settings: Any, prefix: str = "") -> None:

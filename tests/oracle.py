@@ -23,7 +23,7 @@ class Oracle:
 
     def __init__(self, model: CQNModel, dtype: torch.dtype = torch.float32) -> None:
         # A2.2: parameters theta and target parameters theta-bar
-        self.settings, self.dtype, self.dims = model.settings, dtype, model.critic.dims
+        self.settings, self.dtype, self.dims = model.settings, dtype, model.critic.shape.dims
         self.views = len(model.encoders)
         self.weights: dict[str, Tensor] = {}
         for name, weight in model.state_dict().items():

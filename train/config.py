@@ -89,7 +89,7 @@ class PageSettings:
     host: str = "127.0.0.1"  # another one lets other machines reach the page: whoever has the token moves the arm
     port: int = number(8765, least=0, most=65535)  # 0: any free one
     # seconds without a sign of the operator's page after which the arm is paused
-    absent_s: float = number(10.0, least=1, most=3600)
+    absent_s: float = number(10.0, least=1, most=3600, unit="seconds")
 
 
 @dataclass

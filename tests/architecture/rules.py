@@ -187,7 +187,7 @@ def check_floors(source: Source) -> Iterator[str]:
         return
     below = floors[: floors.index(own) + 1]
     for item in source.imports:
-        if within(item.name, room) and (other := item.name[len(room) + 1 :].partition(".")[0]) not in below:
+        if within(item.name, room) and item.name[len(room) + 1 :].partition(".")[0] not in below:
             yield f"{_at(source, item)} imports {item.name or room}; {own} may use {', '.join(below)}"
 
 

@@ -22,7 +22,7 @@ from lerobot_cqn.critic import CQNModel, Features
 from lerobot_cqn.intervals import decode, encode
 from lerobot_cqn.learner import Learner
 from lerobot_cqn.losses import demo_mean, dominance_loss, margin_loss, q_learning_loss
-from lerobot_cqn.networks import CoarseToFineNetwork, ViewEncoder
+from lerobot_cqn.networks import CoarseToFineNetwork, NetworkShape, ViewEncoder
 from lerobot_cqn.schema import Batch, Observation
 from lerobot_cqn.settings import CQNSettings
 
@@ -77,17 +77,12 @@ def golden_model(arrays: Mapping[str, np.ndarray]) -> GoldenModel:
     low_dim_size = online["advantage.low_dim_projection.0.weight"].shape[1]
     hidden_dim, dims = online["advantage.second.weight"].shape[0], arrays["action"].shape[1]
     model = GoldenModel({}, low_dim_size, dims, settings)
+    shape = NetworkShape(
+        pixel_size=pixel_size, low_dim_size=low_dim_size, feature_dim=feature_dim, hidden_dim=hidden_dim, dims=dims,
+        levels=settings.levels, bins=settings.bins, atoms=settings.atoms,
+    )  # fmt: skip
     for name, weights in (("critic", online), ("target_critic", network_weights(arrays, "target"))):
-        network = CoarseToFineNetwork(
-            pixel_size,
-            low_dim_size,
-            feature_dim,
-            hidden_dim,
-            dims,
-            settings.levels,
-            settings.bins,
-            settings.atoms,
-        )
+        network = CoarseToFineNetwork(shape)
         network.load_state_dict(weights)
         setattr(model, name, network)
     model.target_critic.requires_grad_(False)
@@ -117,8 +112,8 @@ def check_critic(arrays: Mapping[str, np.ndarray]) -> Iterator[Deviation]:
     s = model.settings
     observation = Observation((t["features"],), t["low_dim"])
     next_observation = Observation((t["next_features"],), t["next_low_dim"])
-    projected = model.project(model.critic, model.encode(observation))
-    target_projected = model.project(model.target_critic, model.encode(observation))
+    projected = model.precompute(model.critic, model.encode(observation))
+    target_projected = model.precompute(model.target_critic, model.encode(observation))
     indices = encode(t["action"], s.levels, s.bins)
     logits = model.evaluate(model.critic, projected, indices)
     probs = logits.softmax(-1)
@@ -131,7 +126,7 @@ def check_critic(arrays: Mapping[str, np.ndarray]) -> Iterator[Deviation]:
     target_greedy = decode(model.greedy(model.target_critic, target_projected)[0], s.bins)
     yield Deviation("target_greedy_action", _absolute(target_greedy, arrays["target_greedy_action"]), 1e-6)
     next_features = model.encode(next_observation)
-    path, _ = model.greedy(model.critic, model.project(model.critic, next_features))
+    path, _ = model.greedy(model.critic, model.precompute(model.critic, next_features))
     yield Deviation("next_action", _absolute(decode(path, s.bins), arrays["next_action"]), 1e-6)
     target = model.td_target(next_features, t["reward"], t["discount"])
     yield Deviation("target_dist", _relative(target, arrays["target_dist"]), 1e-5)

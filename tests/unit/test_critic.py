@@ -307,7 +307,7 @@ def test_centralized_critic_learns_the_mean_over_dimensions(distributional: bool
     samples = random_batch(alone, 0, P)
     with torch.no_grad():
         path = encode(samples.action, alone.settings.levels, alone.settings.bins)
-        projected = alone.project(alone.critic, alone.encode(samples.observation))
+        projected = alone.precompute(alone.critic, alone.encode(samples.observation))
         taken = take_bin(alone.evaluate(alone.critic, projected, path), path)[..., 0, :]
         target = alone.td_target(alone.encode(samples.next_observation), samples.reward, samples.discount)
         if distributional:

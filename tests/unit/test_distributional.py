@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from lerobot_cqn.critic import CQNModel
-from lerobot_cqn.distributional import expectation, project, support
+from lerobot_cqn.distributional import expectation, project_onto_support, support
 from lerobot_cqn.settings import CQNSettings
 from tests.oracle import Oracle
 
@@ -30,7 +30,7 @@ def test_support_is_even() -> None:
 @given(SEEDS, st.integers(2, 60), st.floats(-3, 3), st.floats(0, 1))
 def test_projection_keeps_the_mass(seed: int, atoms: int, reward: float, discount: float) -> None:
     probs, values = distributions(seed, atoms), support(-1, 1, atoms)
-    projected = project(probs, column(*[reward] * 3), column(*[discount] * 3), values)
+    projected = project_onto_support(probs, column(*[reward] * 3), column(*[discount] * 3), values)
     assert projected.shape == probs.shape
     assert projected.min() >= 0
     assert torch.allclose(projected.sum(-1), torch.ones(3, 2), atol=1e-5)
@@ -40,7 +40,7 @@ def test_projection_keeps_the_mass(seed: int, atoms: int, reward: float, discoun
 def test_projection_keeps_the_mean_inside_the_support(seed: int, atoms: int, discount: float, share: float) -> None:
     probs, values = distributions(seed, atoms), support(-1, 1, atoms)
     reward = share * (1 - discount)  # reward + discount * [-1, 1] stays within [-1, 1]
-    projected = project(probs, column(*[reward] * 3), column(*[discount] * 3), values)
+    projected = project_onto_support(probs, column(*[reward] * 3), column(*[discount] * 3), values)
     expected = reward + discount * expectation(probs, values)
     assert torch.allclose(expectation(projected, values), expected, atol=1e-5)
 
@@ -51,7 +51,7 @@ def test_projection_equals_the_loop_over_atoms(seed: int, atoms: int, reward: fl
     oracle = Oracle(CQNModel({}, 1, 1, settings), torch.float64)
     probs = distributions(seed, atoms)
     rewards, discounts = column(reward, 0.0, -reward), column(discount, 1.0, 0.0)
-    got = project(probs, rewards, discounts, support(-1.5, 0.5, atoms))
+    got = project_onto_support(probs, rewards, discounts, support(-1.5, 0.5, atoms))
     for row in range(2):
         expected = oracle.project(probs[:, row].double(), rewards[:, 0].double(), discounts[:, 0].double())
         assert torch.allclose(got[:, row].double(), expected, atol=1e-5)
@@ -60,7 +60,7 @@ def test_projection_equals_the_loop_over_atoms(seed: int, atoms: int, reward: fl
 @given(SEEDS, st.integers(0, 50))
 def test_discount_zero_gives_all_mass_to_the_reward(seed: int, atom: int) -> None:
     values = support(-1, 1, 51)
-    projected = project(distributions(seed, 51, 1), values[atom].view(1, 1), column(0.0), values)
+    projected = project_onto_support(distributions(seed, 51, 1), values[atom].view(1, 1), column(0.0), values)
     expected = torch.zeros(51)
     expected[atom] = 1
     assert torch.allclose(projected, expected.expand(1, 2, 51), atol=1e-5)
@@ -68,16 +68,18 @@ def test_discount_zero_gives_all_mass_to_the_reward(seed: int, atom: int) -> Non
 
 def test_reward_between_atoms_is_shared_by_hand() -> None:
     probs = torch.full((1, 1, 3), 1 / 3)
-    projected = project(probs, column(0.25), column(0.0), torch.tensor([-1.0, 0.0, 1.0]))
+    projected = project_onto_support(probs, column(0.25), column(0.0), torch.tensor([-1.0, 0.0, 1.0]))
     assert projected.flatten().tolist() == pytest.approx([0, 0.75, 0.25])
 
 
 @pytest.mark.parametrize(("reward", "end"), [(5.0, -1), (-5.0, 0)])
 def test_beyond_the_support_is_moved_to_its_end(reward: float, end: int) -> None:
-    projected = project(distributions(0, 51, 1), column(reward), column(0.9), support(-1, 1, 51))
+    projected = project_onto_support(distributions(0, 51, 1), column(reward), column(0.9), support(-1, 1, 51))
     assert torch.allclose(projected[..., end], torch.ones(1, 2))
 
 
 def test_identity() -> None:
     probs = distributions(1, 51)
-    assert torch.allclose(project(probs, column(0, 0, 0), column(1, 1, 1), support(-1, 1, 51)), probs, atol=1e-5)
+    assert torch.allclose(
+        project_onto_support(probs, column(0, 0, 0), column(1, 1, 1), support(-1, 1, 51)), probs, atol=1e-5
+    )

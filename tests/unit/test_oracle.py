@@ -47,7 +47,7 @@ def random_batch(model: CQNModel, views: int, low_dim: int, demo: str = "some", 
 
     flags = {"some": [1.0, 0.0, 1.0, 0.0, 0.0, 1.0], "none": [0.0] * size, "all": [1.0] * size}[demo]
     discount = torch.tensor([0.9, 0.0, 0.97, 0.97, 0.0, 1.0])[:, None]
-    action = 2 * torch.rand(size, model.critic.dims) - 1
+    action = 2 * torch.rand(size, model.critic.shape.dims) - 1
     return Batch(
         observation=observation(),
         action=action,

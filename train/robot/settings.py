@@ -14,7 +14,7 @@ class ArmSettings:
 
     fps: int | None = number(None, least=1, most=1000)  # control steps a second; None: the dataset's
     # seconds until an episode is cut off and its label is waited for
-    episode_s: float = number(30.0, least=0.1, most=3600)
+    episode_s: float = number(30.0, least=0.1, most=3600, unit="seconds")
     # goals may go so far beyond the joints of the demonstrations, a share of their range
     joint_margin: float = number(0.05, least=0, most=1)
     joint_limits: dict[str, list[float]] = field(default_factory=dict)  # [low, high] of a joint, instead of that
@@ -28,8 +28,10 @@ class ArmSettings:
     home_speed: float = number(0.3, least=0.001, most=1)  # share of the largest speed, (0, 1]
     on_exit: str = "hold"  # or "release": the motors go off, and the arm may fall
     # seconds after which a picture or joint that never changes is a fault
-    stale_s: float = number(1.0, least=0.05, most=60)
-    watchdog_s: float = number(0.5, least=0.05, most=10)  # seconds without a goal after which the arm is held
+    stale_s: float = number(1.0, least=0.05, most=60, unit="seconds")
+    watchdog_s: float = number(
+        0.5, least=0.05, most=10, unit="seconds"
+    )  # seconds without a goal after which the arm is held
 
     def validate(self) -> None:
         """Raises ConfigError for values out of range."""
