@@ -2,7 +2,6 @@
 
 import ast
 import dataclasses
-import importlib.util
 import inspect
 import io
 import re
@@ -343,7 +342,7 @@ def _holds_options(kind: Any, module: str) -> bool:
 
 def pushing() -> list[str]:
     """Section on `cqn-push`."""
-    from cqn_train.push.cli import PushConfig
+    from cqn_train.push.config import PushConfig
 
     return ["## `cqn-push`", "Sends a run's policy to the Hugging Face Hub, with a card.", options(rows(PushConfig))]
 
@@ -355,10 +354,7 @@ def comparisons() -> list[str]:
 
 def page() -> str:
     """The whole page."""
-    parts = [INTRODUCTION.rstrip(), *training(), *policies(), *worlds(), *dataset_tools()]
-    if importlib.util.find_spec("cqn_train.push.cli"):
-        parts += pushing()
-    parts += comparisons()
+    parts = [INTRODUCTION.rstrip(), *training(), *policies(), *worlds(), *dataset_tools(), *pushing(), *comparisons()]
     return "\n\n".join(parts) + "\n"
 
 

@@ -26,7 +26,7 @@ from .interfaces import Environment, Monitor, Nobody, Person, Scenes
 from .loop.gym_env import GymEnvironment, GymScenes, OneScene, check_fits
 from .loop.trainer import Trainer
 from .operator.board import Board
-from .push.cli import check_account
+from .push.send import check_account
 from .replay.buffer import Replay
 from .replay.demonstrations import Demonstrations
 from .replay.episode import Episode

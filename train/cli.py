@@ -2,11 +2,11 @@
 
 import contextlib
 import logging
+import os
 import sys
 import warnings
 from collections.abc import Sequence
 
-from datasets import disable_progress_bars
 from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 
@@ -16,10 +16,8 @@ from lerobot_cqn.errors import CQNError
 from . import envs  # noqa: F401  # registers our environments
 from .arguments import introduction, parse
 from .arm.devices import register_devices
-from .build import build
 from .config import RunConfig, ValidRun
 from .interfaces import Interrupted
-from .push.cli import PushConfig, push
 from .run.progress import ConsoleMonitor
 from .run.stop import StopRequest
 
@@ -49,6 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(valid: ValidRun) -> int:
     """Build and train; 0 when complete, 130 when stopped on request with a checkpoint saved."""
+    from .build import build  # LeRobot's policies, datasets and simulators: seconds that --help need not take
+
     with ConsoleMonitor() as monitor, StopRequest() as should_stop, contextlib.ExitStack() as stack:
         trainer = build(valid, monitor, should_stop, stack)
         try:
@@ -60,6 +60,9 @@ def run(valid: ValidRun) -> int:
         monitor.message(f"Policy: {valid.output_dir}/checkpoints/last/pretrained_model")
     policy = valid.policy
     if policy.push_to_hub:
+        from .push.config import PushConfig
+        from .push.send import push
+
         push(
             PushConfig(
                 run=str(valid.output_dir), repo_id=str(policy.repo_id), private=bool(policy.private),
@@ -80,7 +83,7 @@ def set_up_logging(debug: bool) -> None:
         logging.basicConfig()
     else:
         warnings.simplefilter("ignore")
-        disable_progress_bars()
+        os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(message)s"))
     ours.handlers, ours.propagate = [handler], False

@@ -22,7 +22,7 @@ from cqn_data.terminal.options import parse, parse_all
 from cqn_train import arguments as cqn_train
 from cqn_train.arm.devices import register_devices
 from cqn_train.bench import cli as bench
-from cqn_train.push.cli import PushConfig
+from cqn_train.push.config import PushConfig
 from lerobot_cqn.configuration_cqn import CQNConfig
 from lerobot_cqn.errors import CQNError
 

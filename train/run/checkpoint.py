@@ -12,15 +12,17 @@ import random
 import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from lerobot_cqn.errors import DataError
-from lerobot_cqn.learner import Learner
 
-from ..agent import Agent
+if TYPE_CHECKING:
+    from lerobot_cqn.learner import Learner
+
+    from ..agent import Agent
 
 __all__ = ["Counters", "last_checkpoint", "restore", "save"]
 
@@ -50,8 +52,8 @@ def last_checkpoint(output_dir: Path) -> Path:
 
 def save(
     output_dir: Path,
-    agent: Agent,
-    learner: Learner,
+    agent: "Agent",
+    learner: "Learner",
     rng: np.random.Generator,
     counters: Counters,
     *,
@@ -91,7 +93,7 @@ def save(
     return target
 
 
-def restore(checkpoint: Path, learner: Learner, rng: np.random.Generator) -> tuple[Counters, dict[str, int]]:
+def restore(checkpoint: Path, learner: "Learner", rng: np.random.Generator) -> tuple[Counters, dict[str, int]]:
     """Optimiser and random state; returns counters and table sizes. Weights load with the policy."""
     state = checkpoint / "training_state"
     learner.load_state_dict(torch.load(state / "optimizer.pt", weights_only=True))
