@@ -32,6 +32,7 @@ __all__ = [
     "NEXT_DONE",
     "NEXT_REWARD",
     "NEXT_SUCCESS",
+    "STATE",
     "Batch",
     "Observation",
     "dimension_names",
@@ -39,6 +40,7 @@ __all__ = [
 ]
 
 ACTION = "action"
+STATE = "observation.state"
 NEXT_REWARD = "next.reward"
 NEXT_DONE = "next.done"
 NEXT_SUCCESS = "next.success"

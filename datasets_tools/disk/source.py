@@ -1,7 +1,7 @@
 """Read a local LeRobotDataset v3 without ever touching it or the network."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ from lerobot_cqn.errors import DataError
 from lerobot_cqn.schema import dimension_names
 
 from ..decisions.deltas import KINDS, Deltas
-from ..views.view import Bounds, Camera, Episode, View
+from ..views.episode import Bounds, Camera, Episode
+from ..views.view import View
 from .pictures import shaped, video_pictures
 from .target import read_history
 
@@ -48,11 +49,6 @@ class Source(View):
                 f"{root}: meta/info.json declares {meta.total_frames} frames, the parquet files hold"
                 f" {len(self.rows)}; record or download the dataset again."
             )
-
-    @property
-    def source(self) -> "Source":
-        """Itself."""
-        return self
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:
@@ -163,21 +159,9 @@ class Source(View):
         return episode
 
     def camera_frames(
-        self, episode: Episode, steps: NDArray[np.int64], cameras: dict[str, Camera] | None = None
+        self, episode: Episode, steps: NDArray[np.int64], cameras: Mapping[str, Camera] | None = None
     ) -> Iterator[dict[str, Any]]:
-        """Pictures of the given steps in order, each file read once from front to back.
-
-        Args:
-            episode: from :meth:`episode`, or what a view made of it.
-            steps: (K,) ascending rows of the episode.
-            cameras: what becomes of each camera's pictures; by default all, as they are.
-
-        Yields:
-            {camera: (H, W, 3) uint8}.
-
-        Raises:
-            DataError: a file or a frame cannot be read; names file, episode and frame.
-        """
+        """As :meth:`View.camera_frames`; ``episode`` may be what a view made of the one here."""
         wanted = self.cameras if cameras is None else cameras
         stills = [k for k in wanted if k in self.meta.image_keys]
         videos = {k: self._video(episode, k, steps) for k in wanted if k in self.meta.video_keys}

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_cqn.errors import ConfigError, CQNError, DataError, one_of
-from lerobot_cqn.schema import ACTION, NEXT_DONE, NEXT_REWARD, NEXT_SUCCESS
+from lerobot_cqn.schema import ACTION, NEXT_DONE, NEXT_REWARD, NEXT_SUCCESS, STATE
 
 __all__ = [
     "STATE",
@@ -39,7 +39,6 @@ __all__ = [
     "whole_fps",
 ]
 
-STATE = "observation.state"
 NO_PICTURES = ("none",)
 REWARD_NAMES = {
     NEXT_REWARD: (NEXT_REWARD, "reward", "rewards"),

@@ -279,7 +279,7 @@ def _write(
     from lerobot_cqn.errors import DataError
 
     from ..disk.target import append_history, new_dataset
-    from ..views.view import SOURCE_EPISODE, SOURCE_FRAME
+    from ..views.episode import SOURCE_EPISODE, SOURCE_FRAME
 
     index_feature = {"dtype": "int64", "shape": (1,), "names": None}
     declared = {**features, SOURCE_EPISODE: index_feature, SOURCE_FRAME: index_feature}
@@ -307,7 +307,7 @@ def _add(target: Any, episode: "Episode", plan: _Plan, swap_colors: bool) -> Non
     """All steps of one episode."""
     import numpy as np
 
-    from ..views.view import SOURCE_EPISODE, SOURCE_FRAME
+    from ..views.episode import SOURCE_EPISODE, SOURCE_FRAME
 
     for step, frame in enumerate(episode.frames()):
         if swap_colors:

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_cqn.schema import NEXT_REWARD, NEXT_SUCCESS, dimension_names
+from lerobot_cqn.schema import ACTION, NEXT_REWARD, NEXT_SUCCESS, dimension_names
 from lerobot_cqn.story import code, plain, rows_of, tell
 
-from ..decisions.deltas import ACTION
+from ..disk.pictures import picture_size
 from ..disk.source import Source
-from ..operations.resize import picture_size
 from .readme import Readme, union
 
 __all__ = ["TOOL", "Facts", "Labels", "look", "write_card"]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..disk.source import Source
-from ..views.view import Camera
+from ..views.episode import Camera
 
 if TYPE_CHECKING:
     from .numbers import EpisodeNumbers

@@ -6,10 +6,10 @@ from typing import Literal
 
 import numpy as np
 
-from lerobot_cqn.schema import ACTION, NEXT_REWARD
+from lerobot_cqn.schema import ACTION, NEXT_REWARD, STATE
 
 from .cameras import CameraLook
-from .numbers import STATE, Dimension, Numbers
+from .numbers import Dimension, Numbers
 
 __all__ = ["LEVELS", "Dataset", "Finding", "Level", "Memory", "findings", "memory"]
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.errors import DataError
 
+from ..decisions.joints import match_joints
 from ..disk.source import Source
-from ..views.readable import match_joints
 
 __all__ = ["Correlation", "Follow", "FollowKind"]
 
@@ -75,7 +75,7 @@ class Follow:
     def of(cls, source: Source) -> Self | None:
         """For a dataset whose actions can be matched with its states by name or number; else None."""
         try:
-            action_dims, state_dims = match_joints(source)
+            action_dims, state_dims = match_joints(source.features)
         except DataError:
             return None
         return cls(action_dims, state_dims, source.fps) if action_dims else None

@@ -122,9 +122,11 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
     """Measure and judge; what is damaged becomes a finding, and the rest is looked at all the same."""
     import numpy as np
 
+    from lerobot_cqn.schema import STATE
+
     from .cameras import look, missing_videos
     from .checks import Dataset, findings
-    from .numbers import STATE, measure
+    from .numbers import measure
 
     missing = missing_videos(source)
     with progress() as bar:

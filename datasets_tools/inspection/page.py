@@ -5,9 +5,11 @@ import html
 import io
 from collections.abc import Callable, Iterable, Sequence
 
+from lerobot_cqn.schema import STATE
+
 from .cameras import CameraLook
 from .checks import LEVELS, PAPER_SIZE, Dataset, Finding, memory
-from .numbers import STATE, Dimension, EpisodeNumbers, Numbers
+from .numbers import Dimension, EpisodeNumbers, Numbers
 from .svg import pauses, spark, still_share, threshold_histogram
 
 __all__ = ["page", "sentence_of_actions", "size_text", "verdict"]

@@ -9,7 +9,8 @@ from .job import Step, help_for, main_for, settings_of
 
 if TYPE_CHECKING:
     from ..decisions.deltas import Deltas
-    from ..views.view import Episode, View
+    from ..views.episode import Episode
+    from ..views.view import DerivedView, View
 
 __all__ = ["Delta", "help", "main"]
 
@@ -55,11 +56,11 @@ of the next step minus this one (the way back gives where the arm went, not what
                 "--to=absolute takes its kind from the dataset's history; leave out --of and --keep_absolute."
             )
 
-    def on(self, view: "View") -> "View":
+    def on(self, view: "View") -> "DerivedView":
         """Decide which dimensions are joints; raises ConfigError or DataError where that cannot be done."""
         from ..views.delta import AbsoluteView, DeltaView, described
 
-        after: View
+        after: DerivedView
         if self.to == "absolute":
             deltas = self._known(view)
             after = AbsoluteView(view)
@@ -89,11 +90,10 @@ of the next step minus this one (the way back gives where the arm went, not what
         import numpy as np
 
         from lerobot_cqn.errors import ConfigError, DataError, one_of
-        from lerobot_cqn.schema import dimension_names
+        from lerobot_cqn.schema import ACTION, STATE, dimension_names
 
-        from ..decisions.deltas import ACTION, STATE, Deltas, Kind
-        from ..views.readable import match_joints
-        from ..views.view import gripper_dims
+        from ..decisions.deltas import Deltas, Kind
+        from ..decisions.joints import gripper_dims, match_joints
 
         if view.deltas is not None:
             raise ConfigError(f"The actions are deltas already (kind {view.deltas.kind}); nothing to do.")
@@ -109,7 +109,7 @@ of the next step minus this one (the way back gives where the arm went, not what
             left_out = gripper_dims(names, self.keep_absolute)
             joints = tuple(i for i in range(len(names)) if i not in left_out)
             return Deltas("state", joints, joints)
-        matched = match_joints(view, self.keep_absolute)
+        matched = match_joints(view.features, self.keep_absolute)
         kind = cast(Kind, "command" if self.of == "auto" else self.of)
         if not matched[0]:
             raise DataError(f"No action dimension would be a delta: {', '.join(names)} are all kept absolute.")
@@ -128,9 +128,7 @@ def _show(view: "View") -> None:
     """Range of every dimension after the operation."""
     import numpy as np
 
-    from lerobot_cqn.schema import dimension_names
-
-    from ..decisions.deltas import ACTION
+    from lerobot_cqn.schema import ACTION, dimension_names
 
     def actions(episode: "Episode") -> Any:
         return np.asarray(episode.columns[ACTION], np.float64)

@@ -8,7 +8,7 @@ from ..terminal.options import option
 from .job import Step, help_for, main_for, settings_of
 
 if TYPE_CHECKING:
-    from ..views.view import View
+    from ..views.view import DerivedView, View
 
 __all__ = ["Drop", "help", "main"]
 
@@ -41,7 +41,7 @@ observation.state[gripper.pos], followed by .first, .last, .min, .max, .mean or 
         if not self.episodes and not self.where:
             raise ConfigError("Nothing to drop: expected --episodes='[…]' or --where='RULE'.")
 
-    def on(self, view: "View") -> "View":
+    def on(self, view: "View") -> "DerivedView":
         """Find the episodes; raises ConfigError for a number that is not there."""
         import numpy as np
 
@@ -55,15 +55,16 @@ observation.state[gripper.pos], followed by .first, .last, .min, .max, .mean or 
             raise ConfigError(
                 f"No episode {unknown[0]}: expected numbers from {min(view.episodes)} to {max(view.episodes)}."
             )
-        rule = parse_rule(self.where, view) if self.where else None
+        rule = parse_rule(self.where, view.features) if self.where else None
         dropped: dict[int, str] = {}
         after = Selected(view)
         for index in view.episodes:
             episode = view.episode(index)
             if index in self.episodes:
                 dropped[index] = self.reason or "named"
-            elif rule and rule.holds(episode, view.fps):
-                measured = f"{rule.text} ({rule.quantity(episode, view.fps):.4g})"
+            elif rule and rule.holds(episode.columns, len(episode), view.fps):
+                quantity = rule.quantity(episode.columns, len(episode), view.fps)
+                measured = f"{rule.text} ({quantity:.4g})"
                 dropped[index] = f"{self.reason}: {measured}" if self.reason else measured
             else:
                 after.rows[index] = np.arange(len(episode))

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, Any
 
 from ..terminal.console import note, result, table
 from ..terminal.options import option
-from .job import Job, Step, help_for, main_for, run_job, settings_of
+from .job import Step, help_for, main_for, settings_of
 
 if TYPE_CHECKING:
     from ..decisions.pauses import EpisodeReport, Rule
-    from ..views.view import View
+    from ..views.view import DerivedView, View
 
-__all__ = ["Filter", "filter_dataset", "help", "main"]
+__all__ = ["Filter", "help", "main"]
 
 
 @dataclasses.dataclass
@@ -89,7 +89,7 @@ Delta actions are formed anew, so that they connect the states that are left.
                 raise ConfigError(f"Expected --preview=FILE.mp4 or FILE.png, got '{self.preview}'.")
             refuse_existing(Path(self.preview))
 
-    def on(self, view: "View") -> "View":
+    def on(self, view: "View") -> "DerivedView":
         """Decide which steps stay; reads numbers only, no pictures but for the preview."""
         from ..views.selected import filtered_view
 
@@ -115,11 +115,10 @@ Delta actions are formed anew, so that they connect the states that are left.
     def rule(self, view: "View") -> "tuple[Rule, dict[str, Any]]":
         """What a pause is in this dataset, and how an automatic threshold was decided."""
         from lerobot_cqn.errors import ConfigError, DataError, one_of
-        from lerobot_cqn.schema import dimension_names
+        from lerobot_cqn.schema import ACTION, STATE, dimension_names
 
-        from ..decisions.deltas import ACTION, STATE
+        from ..decisions.joints import gripper_dims
         from ..decisions.pauses import Rule
-        from ..views.view import gripper_dims
 
         for key in (STATE, ACTION):
             if key not in view.features:
@@ -169,7 +168,8 @@ Delta actions are formed anew, so that they connect the states that are left.
 
 def _choose(view: "View", joints: tuple[int, ...]) -> tuple[float, dict[str, Any]]:
     """A threshold from the data, and why; the earlier one where the pauses it would be read from are gone."""
-    from ..decisions.deltas import STATE
+    from lerobot_cqn.schema import STATE
+
     from ..decisions.pause_threshold import suggest
 
     for entry in reversed(view.history()):
@@ -192,11 +192,6 @@ def help() -> str:
 def main(args: list[str]) -> None:
     """Run from the command line; errors as in ``run_job``."""
     main_for(Filter, args)
-
-
-def filter_dataset(job: Job, settings: Filter) -> list[dict[str, Any]]:
-    """Filter a dataset from Python; returns and raises as ``run_job``."""
-    return run_job(job, [settings])
 
 
 def _show(reports: "list[EpisodeReport]") -> None:

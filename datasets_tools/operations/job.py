@@ -13,7 +13,7 @@ from ..terminal.console import load_lerobot, note, progress, result
 from ..terminal.options import help_page, option, parse_all
 
 if TYPE_CHECKING:
-    from ..views.view import View
+    from ..views.view import DerivedView, View
 
 __all__ = ["Job", "Step", "help_for", "main_for", "run_job", "settings_of"]
 
@@ -66,7 +66,7 @@ class Step:
     def validate(self) -> None:
         """Check ranges; raises ConfigError naming the option, what was expected and what was found."""
 
-    def on(self, view: "View") -> "View":
+    def on(self, view: "View") -> "DerivedView":
         """Look at all episodes, print what will be done, and return the view after this operation.
 
         Raises:
@@ -115,9 +115,9 @@ def run_job(job: Job, steps: Sequence[Step], name: str | None = None) -> list[di
         step.validate()
     load_lerobot()
     from ..disk.encode import write
+    from ..disk.readable import readable
     from ..disk.source import local_root, open_source
     from ..disk.target import refuse_existing, refuse_inside
-    from ..views.readable import readable
 
     new_repo_id = job.new_repo_id or f"{job.repo_id}_{name or steps[0].name}"
     new_root = local_root(new_repo_id, job.new_root)
@@ -128,13 +128,13 @@ def run_job(job: Job, steps: Sequence[Step], name: str | None = None) -> list[di
         refuse_existing(Path(job.report))
     source = open_source(job.repo_id, job.root)
     before = len(source.history())
-    view: View = readable(source, job)
+    view = readable(source, job.actions, skip_bad_episodes=job.skip_bad_episodes, needs_videos=not job.dry_run)
     for step in steps:
         if len(steps) > 1:
             result(f"[{step.name}]")
         view = step.on(view)
         view.entry.update({"operation": step.name, "source": job.repo_id, "target": new_repo_id})
-    _check_bounds(steps, view)
+    _check_bounds(steps, view, source.bounds is not None)
     entries = view.history()[before:]
     if job.report:
         Path(job.report).write_text(json.dumps(entries, indent=2) + "\n")
@@ -142,7 +142,7 @@ def run_job(job: Job, steps: Sequence[Step], name: str | None = None) -> list[di
         result("Dry run: nothing was written.")
         return entries
     with progress() as bar:
-        written = write(view, new_repo_id, new_root, bar, skip=job.skip_bad_episodes, crf=job.crf)
+        written = write(view, source, new_repo_id, new_root, bar, skip=job.skip_bad_episodes, crf=job.crf)
     for episode, reason in written.skipped.items():
         note(f"Left out episode {episode}: {reason}")
     how = "videos copied as they were" if written.copied else "videos encoded anew" if source.meta.video_keys else ""
@@ -153,12 +153,12 @@ def run_job(job: Job, steps: Sequence[Step], name: str | None = None) -> list[di
     return view.history()[before:]
 
 
-def _check_bounds(steps: Sequence[Step], view: "View") -> None:
+def _check_bounds(steps: Sequence[Step], view: "View", had_bounds: bool) -> None:
     from lerobot_cqn.errors import ConfigError
 
     names = [step.name for step in steps]
     if "bounds" in names and view.bounds is None:
         after = ", ".join(names[names.index("bounds") + 1 :])
         raise ConfigError(f"bounds must come after the steps that change actions; here these follow it: {after}.")
-    if view.source.bounds is not None and view.bounds is None:
+    if had_bounds and view.bounds is None:
         note("The source's action bounds do not hold for the result; set them again with bounds.")

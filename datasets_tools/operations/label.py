@@ -1,16 +1,17 @@
 """``cqn-data label``: sparse rewards, done and success from a list, a column, a rule, or for all episodes."""
 
 import dataclasses
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..terminal.console import note, table
 from ..terminal.options import option
-from ..views.view import Episode, View
 from .job import Step, help_for, main_for, settings_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
+
+    from ..views.episode import Episode
+    from ..views.view import DerivedView, View
 
 __all__ = ["Label", "help", "main"]
 
@@ -51,9 +52,10 @@ Videos are copied as they are. Rules: QUANTITY OPERATOR NUMBER, see drop --help.
             found = ", ".join(f"--{n}" for n in given) or "none"
             raise ConfigError(f"Expected one of --all, --episodes, --failed, --column, --rule; got {found}.")
 
-    def on(self, view: View) -> View:
+    def on(self, view: "View") -> "DerivedView":
         """Judge every episode; raises ConfigError for an unknown episode, column or rule."""
         from ..decisions.rewards import REWARD_FEATURES
+        from ..views.labelled import Labelled
 
         judge = self._judge(view)
         successes = {i: judge(view.episode(i)) for i in view.episodes}
@@ -70,7 +72,7 @@ Videos are copied as they are. Rules: QUANTITY OPERATOR NUMBER, see drop --help.
         after.entry.update(settings=settings_of(self), failures=[i for i, ok in successes.items() if not ok])
         return after
 
-    def _judge(self, view: View) -> Callable[[Episode], bool]:
+    def _judge(self, view: "View") -> "Callable[[Episode], bool]":
         import numpy as np
 
         from lerobot_cqn.errors import ConfigError, one_of
@@ -78,8 +80,8 @@ Videos are copied as they are. Rules: QUANTITY OPERATOR NUMBER, see drop --help.
         from ..decisions.episode_rules import parse_rule
 
         if self.rule:
-            rule = parse_rule(self.rule, view)
-            return lambda episode: rule.holds(episode, view.fps)
+            rule = parse_rule(self.rule, view.features)
+            return lambda episode: rule.holds(episode.columns, len(episode), view.fps)
         if self.column is not None:
             column = self.column
             numbers = [k for k, f in view.features.items() if f["dtype"] not in ("string", "image", "video")]
@@ -94,27 +96,6 @@ Videos are copied as they are. Rules: QUANTITY OPERATOR NUMBER, see drop --help.
         if self.failed:
             return lambda episode: episode.index not in self.failed
         return lambda episode: self.all or episode.index in self.episodes
-
-
-@dataclasses.dataclass
-class Labelled(View):
-    """With sparse rewards."""
-
-    successes: dict[int, bool] = dataclasses.field(default_factory=dict)
-
-    @property
-    def features(self) -> dict[str, dict[str, Any]]:
-        """With the reward columns."""
-        from ..decisions.rewards import REWARD_FEATURES
-
-        return {**self.parent.features, **REWARD_FEATURES}
-
-    def episode(self, index: int) -> Episode:
-        """The steps with rewards."""
-        from ..decisions.rewards import last_step_rewards
-
-        episode = self.parent.episode(index)
-        return episode.with_columns(last_step_rewards(len(episode), success=self.successes[index]))
 
 
 def _short(numbers: "Sequence[str]") -> str:

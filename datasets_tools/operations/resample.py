@@ -1,20 +1,16 @@
 """``cqn-data resample``: fewer steps a second, e.g. 30 -> 10; no command or reward in between is lost."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from ..terminal.console import result
 from ..terminal.options import option
-from ..views.view import Bounds, Episode, View
 from .job import Step, help_for, main_for, settings_of
 
 if TYPE_CHECKING:
-    from ..decisions.deltas import Deltas
+    from ..views.view import DerivedView, View
 
-__all__ = ["Resample", "Resampled", "help", "main", "windows"]
+__all__ = ["Resample", "help", "main"]
 
 
 @dataclasses.dataclass
@@ -40,9 +36,11 @@ that they connect the states), the sum of the rewards in between, and done or su
         if self.fps < 1:
             raise ConfigError(f"Expected --fps >= 1, got {self.fps}.")
 
-    def on(self, view: View) -> View:
+    def on(self, view: "View") -> "DerivedView":
         """Raises ConfigError for a rate that would need frames that do not exist."""
         from lerobot_cqn.errors import ConfigError
+
+        from ..views.resampled import Resampled
 
         if self.fps >= view.fps:
             raise ConfigError(
@@ -54,51 +52,6 @@ that they connect the states), the sum of the rewards in between, and done or su
         result(f"{old} steps at {view.fps} Hz become {new} at {self.fps} Hz.")
         after.entry.update(settings=settings_of(self) | {"from_fps": view.fps}, total={"steps": old, "kept": new})
         return after
-
-
-@dataclasses.dataclass
-class Resampled(View):
-    """With fewer steps a second."""
-
-    rate: int = 1
-
-    @property
-    def fps(self) -> int:
-        """The new rate."""
-        return self.rate
-
-    @property
-    def bounds(self) -> Bounds | None:
-        """Those of the view before were for other steps."""
-        return None
-
-    def episode(self, index: int) -> Episode:
-        """The chosen steps."""
-        return _resampled(self.parent.episode(index), self.parent.fps, self.rate, self.parent.deltas)
-
-
-def windows(steps: int, old: int, new: int) -> NDArray[np.int64]:
-    """(K,) first row of each new step; the rows until the next one belong to it. ``new`` < ``old``, in Hz."""
-    count = -(-steps * new // old)
-    starts: NDArray[np.int64] = np.floor(np.arange(count) * (old / new) + 0.5).astype(np.int64)
-    return starts[starts < steps]
-
-
-def _resampled(episode: Episode, old: int, new: int, deltas: "Deltas | None") -> Episode:
-    from lerobot_cqn.schema import NEXT_DONE, NEXT_REWARD, NEXT_SUCCESS
-
-    from ..decisions.deltas import select
-
-    rows = windows(len(episode), old, new)
-    last = np.append(rows[1:], len(episode)) - 1
-    chosen = select(episode, rows, deltas, action_rows=last)
-    joined: dict[str, Any] = {}
-    if NEXT_REWARD in episode.columns:
-        joined[NEXT_REWARD] = np.add.reduceat(episode.columns[NEXT_REWARD], rows, axis=0)
-    for key in (NEXT_DONE, NEXT_SUCCESS, "next.truncated"):
-        if key in episode.columns:
-            joined[key] = np.logical_or.reduceat(episode.columns[key], rows, axis=0)
-    return chosen.with_columns(joined)
 
 
 def help() -> str:

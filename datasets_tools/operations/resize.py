@@ -1,11 +1,13 @@
 """``cqn-data resize``: smaller pictures, e.g. 480x640 -> 84x84, cut out first where asked."""
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ..terminal.console import note, table
-from ..views.view import Camera, View
 from .job import Step, help_for, main_for, settings_of
+
+if TYPE_CHECKING:
+    from ..views.view import DerivedView, View
 
 __all__ = ["Resize", "help", "main"]
 
@@ -48,9 +50,13 @@ alias. A camera may be named in full (observation.images.top) or by its last par
             if len(box) != 4 or min(box[:2]) < 0 or min(box[2:]) < 2:
                 raise ConfigError(f"Expected --crop='{{\"{name}\": [top, left, height, width]}}', got {box}.")
 
-    def on(self, view: View) -> View:
+    def on(self, view: "View") -> "DerivedView":
         """Check crops against the pictures; raises ConfigError for an unknown camera or a box outside."""
         from lerobot_cqn.errors import ConfigError
+
+        from ..disk.pictures import picture_size
+        from ..views.episode import Camera
+        from ..views.resized import Resized
 
         if not view.cameras:
             raise ConfigError(
@@ -83,34 +89,7 @@ alias. A camera may be named in full (observation.images.top) or by its last par
         return after
 
 
-@dataclasses.dataclass
-class Resized(View):
-    """With other picture sizes."""
-
-    shapes: dict[str, Camera] = dataclasses.field(default_factory=dict)
-
-    @property
-    def cameras(self) -> dict[str, Camera]:
-        """What becomes of each camera's pictures."""
-        return self.shapes
-
-    @property
-    def features(self) -> dict[str, dict[str, Any]]:
-        """With the new shapes, (H, W, 3)."""
-        names = ["height", "width", "channels"]
-        new = {k: {"shape": (*c.size, 3), "names": names} for k, c in self.shapes.items() if c.size}
-        return {k: {**f, **new.get(k, {})} for k, f in self.parent.features.items()}
-
-
-def picture_size(feature: dict[str, Any]) -> tuple[int, int]:
-    """Height and width of a camera's pictures, whichever axis its channels are."""
-    shape, names = feature["shape"], feature.get("names")
-    channels_first = names[0] in ("channels", "channel") if isinstance(names, list) else shape[0] in (1, 3)
-    height, width = shape[1:] if channels_first else shape[:2]
-    return int(height), int(width)
-
-
-def _camera(view: View, name: str) -> str:
+def _camera(view: "View", name: str) -> str:
     from lerobot_cqn.errors import ConfigError, one_of
 
     found = [k for k in view.cameras if name in (k, k.rsplit(".", 1)[-1])]

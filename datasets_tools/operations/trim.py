@@ -8,7 +8,8 @@ from ..terminal.options import option
 from .job import Step, help_for, main_for, settings_of
 
 if TYPE_CHECKING:
-    from ..views.view import Episode, View
+    from ..views.episode import Episode
+    from ..views.view import DerivedView, View
 
 __all__ = ["Trim", "help", "main"]
 
@@ -59,7 +60,7 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
 
         return Filter(threshold=self.threshold, auto=self.auto)
 
-    def on(self, view: "View") -> "View":
+    def on(self, view: "View") -> "DerivedView":
         """Find where each episode begins and ends; raises DataError where too little or a reward would be lost."""
         import numpy as np
 
@@ -123,7 +124,8 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
         """The part from the first motion to the last, with the still steps asked for around it."""
         import numpy as np
 
-        from ..decisions.deltas import ACTION, STATE
+        from lerobot_cqn.schema import ACTION, STATE
+
         from ..decisions.pauses import keep_mask
 
         state, action = (episode.columns[k][start:stop] for k in (STATE, ACTION))

@@ -5,16 +5,17 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_cqn.schema import dimension_names
+from lerobot_cqn.schema import ACTION, STATE, dimension_names
 
-from ..decisions.deltas import ACTION, STATE, Deltas, absolute_action, delta_action
-from .view import Bounds, Episode, View
+from ..decisions.deltas import Deltas, absolute_action, delta_action
+from .episode import Bounds, Episode
+from .view import DerivedView, View
 
 __all__ = ["AbsoluteView", "DeltaView", "described"]
 
 
 @dataclass
-class DeltaView(View):
+class DeltaView(DerivedView):
     """With some action dimensions as differences; where there were no actions, they are made from the states."""
 
     made: Deltas | None = None
@@ -42,11 +43,11 @@ class DeltaView(View):
             state = episode.columns[STATE]
             episode = episode.with_columns({ACTION: np.concatenate([state[1:], state[-1:]])})
         assert self.made is not None  # noqa: S101  # set by whoever made this view
-        return episode.with_columns({ACTION: delta_action(episode, self.made)})
+        return episode.with_columns({ACTION: delta_action(episode.columns, self.made)})
 
 
 @dataclass
-class AbsoluteView(View):
+class AbsoluteView(DerivedView):
     """With all action dimensions absolute."""
 
     @property
@@ -62,7 +63,7 @@ class AbsoluteView(View):
     def episode(self, index: int) -> Episode:
         """The steps with absolute actions."""
         episode, deltas = self.parent.episode(index), self.parent.deltas
-        return episode if deltas is None else episode.with_columns({ACTION: absolute_action(episode, deltas)})
+        return episode if deltas is None else episode.with_columns({ACTION: absolute_action(episode.columns, deltas)})
 
 
 def described(view: View, deltas: Deltas) -> dict[str, Any]:

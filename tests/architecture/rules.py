@@ -5,7 +5,7 @@ names (`cqn_train`, `cqn_data`, `lerobot_policy_cqn`) are translated back to the
 """
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,6 +27,17 @@ ROOM_MAY_USE: dict[str, tuple[str, ...]] = {
 # --- Parts of `train` that know neither one another nor the loop: they meet in the modules named here.
 SEPARATE_PARTS = ("train.envs", "train.robot", "train.operator")
 MEETING_PLACE = "train.interfaces"
+
+# --- Inside datasets_tools: its folders and single modules, lowest first. Each may use itself and the rows before.
+DATA_ROWS: tuple[set[str], ...] = (
+    {"terminal"},
+    {"decisions"},
+    {"views"},
+    {"disk"},
+    {"operations"},
+    {"formats", "inspection", "hub"},
+    {"record", "cli"},
+)
 
 # --- Inside lerobot_cqn: each module and the siblings it may import.
 _BASE = {"errors", "schema"}
@@ -214,6 +225,46 @@ def check_layers(source: Source) -> Iterator[str]:
             yield f"{_at(source, item)} imports {item.name}; {name} may use {may}"
 
 
+def check_data_rows(source: Source) -> Iterator[str]:
+    """Inside datasets_tools, imports go up the table DATA_ROWS only; inside functions and for types as well."""
+    room, _, inside = source.module.partition(".")
+    if room != "datasets_tools" or not inside:
+        return
+    own = inside.split(".")[0]
+    below: set[str] = set()
+    for row in DATA_ROWS:
+        if own in row:
+            break
+        below |= row
+    else:
+        yield f"{source.path}:1 lies in {own}, which the table DATA_ROWS of tests/architecture/rules.py has not"
+        return
+    for item in source.imports:
+        part = [*item.name.split("."), ""][1]
+        if within(item.name, "datasets_tools") and part not in below | {own}:
+            yield f"{_at(source, item)} imports {item.name}; {own} may use {', '.join(sorted(below)) or 'no other'}"
+
+
+def circles(sources: Iterable[Source]) -> list[str]:
+    """Modules that import one another around a circle, imports inside functions and for types included."""
+    by_name = {source.module: source for source in sources}
+    needs = {
+        name: {found for item in source.imports if (found := _module_of(item.name, by_name)) and found != name}
+        for name, source in by_name.items()
+    }
+    while ready := [name for name, others in needs.items() if not others & needs.keys()]:
+        for name in ready:
+            del needs[name]
+    return sorted(needs)
+
+
+def _module_of(name: str, modules: Mapping[str, Source]) -> str:
+    """The module that an imported name is or lies in; "" for one of another package."""
+    while name and name not in modules:
+        name = name.rpartition(".")[0]
+    return name
+
+
 def check_separate_parts(source: Source) -> Iterator[str]:
     """Environments, robot and operator page meet only in train/interfaces.py."""
     part = next((part for part in SEPARATE_PARTS if within(source.module, part)), None)
@@ -266,6 +317,7 @@ ROOM_CHECKS = (
     check_rooms,
     check_relative,
     check_layers,
+    check_data_rows,
     check_separate_parts,
     check_optional,
 )
