@@ -11,28 +11,17 @@ of step t, s[t] the measured one before it. Three kinds of difference are in use
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_cqn.delta_actions import DeltaJoints, Kind
 from lerobot_cqn.schema import ACTION, STATE
 
-__all__ = ["KINDS", "Deltas", "Kind", "absolute_action", "delta_action", "to_absolute", "to_delta"]
+__all__ = ["absolute_action", "delta_action", "to_absolute", "to_delta"]
 
 type Array = NDArray[np.float64]
-Kind = Literal["command", "command_steps", "state"]
-KINDS: tuple[str, ...] = get_args(Kind)
-
-
-@dataclass(frozen=True)
-class Deltas:
-    """Which action dimensions are differences: (J,) of the action, and the (J,) of the state they belong to."""
-
-    kind: Kind
-    action_dims: tuple[int, ...]
-    state_dims: tuple[int, ...]
 
 
 def to_delta(absolute: NDArray[Any], state: NDArray[Any], kind: Kind) -> Array:
@@ -60,17 +49,17 @@ def to_absolute(delta: NDArray[Any], state: NDArray[Any], kind: Kind) -> Array:
     return s[:1] + np.cumsum(d, axis=0) if kind == "command_steps" else s + d
 
 
-def delta_action(columns: Mapping[str, Any], deltas: Deltas) -> NDArray[Any]:
+def delta_action(columns: Mapping[str, Any], deltas: DeltaJoints) -> NDArray[Any]:
     """(T, A) an episode's absolute actions with the chosen dimensions as differences, in their dtype."""
     return _convert(columns, deltas, to_delta)
 
 
-def absolute_action(columns: Mapping[str, Any], deltas: Deltas) -> NDArray[Any]:
+def absolute_action(columns: Mapping[str, Any], deltas: DeltaJoints) -> NDArray[Any]:
     """(T, A) an episode's delta actions with all dimensions absolute, in their dtype."""
     return _convert(columns, deltas, to_absolute)
 
 
-def _convert(columns: Mapping[str, Any], deltas: Deltas, function: Any) -> NDArray[Any]:
+def _convert(columns: Mapping[str, Any], deltas: DeltaJoints, function: Any) -> NDArray[Any]:
     action: NDArray[Any] = np.array(columns[ACTION], copy=True)
     joints, own = list(deltas.action_dims), list(deltas.state_dims)
     action[:, joints] = function(action[:, joints], columns[STATE][:, own], deltas.kind)

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import cast
 
+from lerobot_cqn.delta_actions import DeltaJoints, Kind
 from lerobot_cqn.errors import DataError
 
-from ..decisions.deltas import Deltas, Kind
 from ..decisions.joints import match_joints
 from ..terminal.console import note
 from ..views.view import DerivedView
@@ -20,7 +20,7 @@ class Readable(DerivedView):
     """Without the episodes that cannot be read; with what the caller said of the actions."""
 
     readable: Sequence[int] = field(default_factory=tuple)
-    said: Deltas | None = None
+    said: DeltaJoints | None = None
 
     @property
     def episodes(self) -> Sequence[int]:
@@ -28,7 +28,7 @@ class Readable(DerivedView):
         return self.readable
 
     @property
-    def deltas(self) -> Deltas | None:
+    def deltas(self) -> DeltaJoints | None:
         """As the caller said, else as the source's history says."""
         return self.said
 
@@ -65,7 +65,7 @@ def readable(source: Source, actions: str, *, skip_bad_episodes: bool, needs_vid
     return view
 
 
-def _deltas(source: Source, actions: str) -> Deltas | None:
+def _deltas(source: Source, actions: str) -> DeltaJoints | None:
     if actions == "auto":
         return source.deltas
-    return None if actions == "absolute" else Deltas(cast(Kind, actions), *match_joints(source.features))
+    return None if actions == "absolute" else DeltaJoints(cast(Kind, actions), *match_joints(source.features))

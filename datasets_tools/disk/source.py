@@ -13,10 +13,9 @@ from lerobot.datasets.io_utils import load_nested_dataset
 from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
 from numpy.typing import NDArray
 
+from lerobot_cqn.delta_actions import DeltaJoints, current_description, parse
 from lerobot_cqn.errors import DataError
-from lerobot_cqn.schema import dimension_names
 
-from ..decisions.deltas import KINDS, Deltas
 from ..views.episode import Bounds, Camera, Episode
 from ..views.view import View
 from .pictures import shaped, video_pictures
@@ -72,27 +71,10 @@ class Source(View):
         return {k: Camera() for k in (*self.meta.video_keys, *self.meta.image_keys) if k not in self.meta.depth_keys}
 
     @property
-    def deltas(self) -> Deltas | None:
+    def deltas(self) -> DeltaJoints | None:
         """What the dataset's own history says about its actions; None where it says nothing."""
-        for entry in reversed(self.history()):
-            if "deltas" in entry:
-                return self.named_deltas(entry["deltas"]) if entry["deltas"] else None
-        return None
-
-    def named_deltas(self, described: dict[str, Any]) -> Deltas:
-        """Deltas from a history entry ``{"kind": …, "action": names, "state": names}``."""
-        states = dimension_names(self.features["observation.state"])
-        actions = dimension_names(self.features["action"])
-        try:
-            if described["kind"] not in KINDS:
-                raise ValueError(described["kind"])
-            return Deltas(
-                described["kind"],
-                tuple(actions.index(n) for n in described["action"]),
-                tuple(states.index(n) for n in described["state"]),
-            )
-        except (KeyError, ValueError, TypeError) as error:
-            raise DataError(f"{self.root}: meta/cqn_history.json does not fit the features: {error!r}.") from error
+        now = current_description(self.history())
+        return None if now is None else parse(now, self.features, self.root)
 
     @property
     def bounds(self) -> Bounds | None:

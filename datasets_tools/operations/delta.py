@@ -8,7 +8,8 @@ from ..terminal.options import option
 from .job import Step, help_for, main_for, settings_of
 
 if TYPE_CHECKING:
-    from ..decisions.deltas import Deltas
+    from lerobot_cqn.delta_actions import DeltaJoints
+
     from ..views.episode import Episode
     from ..views.view import DerivedView, View
 
@@ -44,9 +45,8 @@ of the next step minus this one (the way back gives where the arm went, not what
 
     def validate(self) -> None:
         """Check choices; raises ConfigError naming the option and the valid values."""
+        from lerobot_cqn.delta_actions import KINDS
         from lerobot_cqn.errors import ConfigError, one_of
-
-        from ..decisions.deltas import KINDS
 
         for name, valid in (("to", ("delta", "absolute")), ("of", ("auto", *KINDS))):
             if getattr(self, name) not in valid:
@@ -58,7 +58,9 @@ of the next step minus this one (the way back gives where the arm went, not what
 
     def on(self, view: "View") -> "DerivedView":
         """Decide which dimensions are joints; raises ConfigError or DataError where that cannot be done."""
-        from ..views.delta import AbsoluteView, DeltaView, described
+        from lerobot_cqn.delta_actions import description
+
+        from ..views.delta import AbsoluteView, DeltaView
 
         after: DerivedView
         if self.to == "absolute":
@@ -69,14 +71,14 @@ of the next step minus this one (the way back gives where the arm went, not what
         else:
             deltas = self._wanted(view)
             after = DeltaView(view, made=deltas)
-        names = described(view, deltas)
+        names = description(deltas, view.features)
         result(f"{self.to.capitalize()} actions of kind {deltas.kind}: {', '.join(names['action'])}")
         _show(after)
         now = names if self.to == "delta" else None
         after.entry.update(settings=settings_of(self) | {"of": deltas.kind}, deltas=now)
         return after
 
-    def _known(self, view: "View") -> "Deltas":
+    def _known(self, view: "View") -> "DeltaJoints":
         from lerobot_cqn.errors import ConfigError
 
         if view.deltas is None:
@@ -86,13 +88,13 @@ of the next step minus this one (the way back gives where the arm went, not what
             )
         return view.deltas
 
-    def _wanted(self, view: "View") -> "Deltas":
+    def _wanted(self, view: "View") -> "DeltaJoints":
         import numpy as np
 
+        from lerobot_cqn.delta_actions import DeltaJoints, Kind
         from lerobot_cqn.errors import ConfigError, DataError, one_of
         from lerobot_cqn.schema import ACTION, STATE, dimension_names
 
-        from ..decisions.deltas import Deltas, Kind
         from ..decisions.joints import gripper_dims, match_joints
 
         if view.deltas is not None:
@@ -108,7 +110,7 @@ of the next step minus this one (the way back gives where the arm went, not what
                 raise DataError(f"There is no '{ACTION}' to take commands from; leave out --of={self.of}.")
             left_out = gripper_dims(names, self.keep_absolute)
             joints = tuple(i for i in range(len(names)) if i not in left_out)
-            return Deltas("state", joints, joints)
+            return DeltaJoints("state", joints, joints)
         matched = match_joints(view.features, self.keep_absolute)
         kind = cast(Kind, "command" if self.of == "auto" else self.of)
         if not matched[0]:
@@ -121,7 +123,7 @@ of the next step minus this one (the way back gives where the arm went, not what
             gap.append(np.abs(columns[ACTION][:, list(matched[0])] - state).mean(axis=0))
         if (np.mean(gap, axis=0) > np.maximum(high - low, 1e-9)).mean() > 0.5:
             note("Most commands are farther from the arm than it ever moves: these actions look like deltas already.")
-        return Deltas(kind, *matched)
+        return DeltaJoints(kind, *matched)
 
 
 def _show(view: "View") -> None:

@@ -45,9 +45,8 @@ class Job:
 
     def validate(self) -> None:
         """Check choices; raises ConfigError naming the option and the valid values."""
+        from lerobot_cqn.delta_actions import KINDS
         from lerobot_cqn.errors import ConfigError, one_of
-
-        from ..decisions.deltas import KINDS
 
         if self.crf is not None and not 0 <= self.crf <= 63:
             raise ConfigError(f"Expected --crf in [0, 63], got {self.crf}.")

@@ -5,20 +5,21 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_cqn.schema import ACTION, STATE, dimension_names
+from lerobot_cqn.delta_actions import DeltaJoints
+from lerobot_cqn.schema import ACTION, STATE
 
-from ..decisions.deltas import Deltas, absolute_action, delta_action
+from ..decisions.deltas import absolute_action, delta_action
 from .episode import Bounds, Episode
-from .view import DerivedView, View
+from .view import DerivedView
 
-__all__ = ["AbsoluteView", "DeltaView", "described"]
+__all__ = ["AbsoluteView", "DeltaView"]
 
 
 @dataclass
 class DeltaView(DerivedView):
     """With some action dimensions as differences; where there were no actions, they are made from the states."""
 
-    made: Deltas | None = None
+    made: DeltaJoints | None = None
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:
@@ -27,7 +28,7 @@ class DeltaView(DerivedView):
         return features if ACTION in features else {**features, ACTION: dict(features[STATE])}
 
     @property
-    def deltas(self) -> Deltas | None:
+    def deltas(self) -> DeltaJoints | None:
         """What the actions are now."""
         return self.made
 
@@ -51,7 +52,7 @@ class AbsoluteView(DerivedView):
     """With all action dimensions absolute."""
 
     @property
-    def deltas(self) -> Deltas | None:
+    def deltas(self) -> DeltaJoints | None:
         """None."""
         return None
 
@@ -64,14 +65,3 @@ class AbsoluteView(DerivedView):
         """The steps with absolute actions."""
         episode, deltas = self.parent.episode(index), self.parent.deltas
         return episode if deltas is None else episode.with_columns({ACTION: absolute_action(episode.columns, deltas)})
-
-
-def described(view: View, deltas: Deltas) -> dict[str, Any]:
-    """Deltas by the names of their dimensions, as the history keeps them."""
-    states = dimension_names(view.features[STATE])
-    actions = dimension_names(view.features.get(ACTION, view.features[STATE]))
-    return {
-        "kind": deltas.kind,
-        "action": [actions[i] for i in deltas.action_dims],
-        "state": [states[i] for i in deltas.state_dims],
-    }

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_cqn.delta_actions import DeltaJoints
 from lerobot_cqn.schema import NEXT_DONE, NEXT_REWARD, NEXT_SUCCESS
 
-from ..decisions.deltas import Deltas
 from .episode import Bounds, Episode
 from .selected import select
 from .view import DerivedView
@@ -44,7 +44,7 @@ def windows(steps: int, old: int, new: int) -> NDArray[np.int64]:
     return starts[starts < steps]
 
 
-def _resampled(episode: Episode, old: int, new: int, deltas: Deltas | None) -> Episode:
+def _resampled(episode: Episode, old: int, new: int, deltas: DeltaJoints | None) -> Episode:
     rows = windows(len(episode), old, new)
     last = np.append(rows[1:], len(episode)) - 1
     chosen = select(episode, rows, deltas, action_rows=last)

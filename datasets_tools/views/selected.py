@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_cqn.delta_actions import DeltaJoints
 from lerobot_cqn.errors import DataError
 from lerobot_cqn.schema import ACTION, STATE
 
-from ..decisions.deltas import Deltas, absolute_action, delta_action
+from ..decisions.deltas import absolute_action, delta_action
 from ..decisions.joints import match_joints
 from ..decisions.pauses import EpisodeReport, Rule, keep_mask, report_episode
 from ..decisions.rewards import carries_reward
@@ -46,7 +47,7 @@ class Selected(DerivedView):
 
 
 def select(
-    episode: Episode, rows: NDArray[np.int64], deltas: Deltas | None, action_rows: NDArray[np.int64] | None = None
+    episode: Episode, rows: NDArray[np.int64], deltas: DeltaJoints | None, action_rows: NDArray[np.int64] | None = None
 ) -> Episode:
     """Some rows of an episode, with delta actions formed anew so that they connect the states that are left.
 

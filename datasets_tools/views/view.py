@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..decisions.deltas import Deltas
+from lerobot_cqn.delta_actions import DeltaJoints
+
 from .episode import Bounds, Camera, Episode
 
 __all__ = ["DerivedView", "View"]
@@ -43,7 +44,7 @@ class View(ABC):
 
     @property
     @abstractmethod
-    def deltas(self) -> Deltas | None:
+    def deltas(self) -> DeltaJoints | None:
         """Which action dimensions are differences and of what; None where all are absolute."""
 
     @property
@@ -115,7 +116,7 @@ class DerivedView(View):
         return self.parent.cameras
 
     @property
-    def deltas(self) -> Deltas | None:
+    def deltas(self) -> DeltaJoints | None:
         """Those of the view before."""
         return self.parent.deltas
 

@@ -20,7 +20,13 @@ INSTALLED_AS = {
 ROOM_MAY_USE: dict[str, tuple[str, ...]] = {
     "lerobot_cqn": (),
     "lerobot_cqn._plugin": ("train.envs", "train.sim_arm"),
-    "datasets_tools": ("lerobot_cqn.schema", "lerobot_cqn.errors", "lerobot_cqn.hub_errors", "lerobot_cqn.story"),
+    "datasets_tools": (
+        "lerobot_cqn.schema",
+        "lerobot_cqn.errors",
+        "lerobot_cqn.delta_actions",
+        "lerobot_cqn.hub_errors",
+        "lerobot_cqn.story",
+    ),
     "train": ("lerobot_cqn", "datasets_tools"),
 }
 
@@ -61,7 +67,8 @@ SIBLINGS: dict[str, set[str]] = {
     # What LeRobot sees; the modules above know nothing of it.
     "base_config": _BASE | {"settings"},
     "base_policy": _BASE | _SETTINGS | {"model", "model_card", "hub_errors"},
-    "joint_goals": _BASE,
+    "delta_actions": _BASE,
+    "joint_goals": _BASE | {"delta_actions"},
     "fit_pictures": _BASE,
     "story": _BASE,
     "hub_errors": _BASE,

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cqn_data.decisions.deltas import KINDS, Deltas, absolute_action, delta_action, to_absolute, to_delta
+from cqn_data.decisions.deltas import absolute_action, delta_action, to_absolute, to_delta
 from cqn_data.decisions.episode_rules import parse_rule
 from cqn_data.disk.source import open_source
 from cqn_data.operations.label import Label
@@ -19,11 +19,12 @@ from cqn_data.views.episode import Bounds, Episode
 from cqn_data.views.resampled import Resampled, windows
 from cqn_data.views.selected import Selected, select
 from cqn_data.views.view import DerivedView, View
+from lerobot_cqn.delta_actions import KINDS, DeltaJoints
 from lerobot_cqn.errors import ConfigError, DataError
 
 from ..toy_datasets import make_dataset
 
-JOINTS = Deltas("command", (0, 1), (0, 1))
+JOINTS = DeltaJoints("command", (0, 1), (0, 1))
 VECTOR = {"dtype": "float32", "shape": (3,), "names": ["a.pos", "b.pos", "gripper.pos"]}
 REWARD = {"dtype": "float32", "shape": (1,), "names": None}
 
@@ -34,7 +35,7 @@ class Memory(DerivedView):
 
     parent: View | None = None
     data: dict = dataclasses.field(default_factory=dict)
-    kind: Deltas | None = None
+    kind: DeltaJoints | None = None
     extra: dict = dataclasses.field(default_factory=dict)
 
     features = property(lambda self: {"observation.state": VECTOR, "action": VECTOR, **self.extra})
@@ -62,7 +63,7 @@ def episodes(draw, kinds=(None, *KINDS), least=1):
     steps = draw(st.integers(least, 30))
     values = arrays(np.float32, (steps, 3), elements=st.floats(-10, 10, width=32))
     kind = draw(st.sampled_from(kinds))
-    deltas = None if kind is None else Deltas(kind, (0, 1), (0, 1))
+    deltas = None if kind is None else DeltaJoints(kind, (0, 1), (0, 1))
     return make_episode(draw(values), draw(values)), deltas
 
 
@@ -153,7 +154,7 @@ def test_bounds_leave_out_the_share_asked_for(parts, quantile):
 
 @given(arrays(np.float32, (20, 3), elements=st.floats(-5, 5, width=32)))
 def test_a_margin_widens_differences_and_leaves_absolute_actions(values):
-    view = Memory(data={0: make_episode(np.zeros_like(values), values)}, kind=Deltas("state", (0, 2), (0, 2)))
+    view = Memory(data={0: make_episode(np.zeros_like(values), values)}, kind=DeltaJoints("state", (0, 2), (0, 2)))
     found = quantile_bounds(view, [0], 0.0, margin=0.25)
     low, high = values.min(axis=0).astype(np.float64), values.max(axis=0).astype(np.float64)
     spread = 0.25 * (high - low) * [1, 0, 1]
