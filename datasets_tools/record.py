@@ -7,7 +7,7 @@ import contextlib
 import inspect
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -76,9 +76,9 @@ class ScriptedTeleoperator(Protocol):
         """Action for the environment's present state, (A,) float32."""
 
 
-def help() -> str:
+def help(summary: str) -> str:
     """Help page."""
-    return help_page("record", "record scripted demonstrations", RecordConfig, EXAMPLE, NOTES)
+    return help_page("record", summary, RecordConfig, EXAMPLE, NOTES)
 
 
 def main(args: list[str]) -> None:
@@ -220,7 +220,7 @@ class _Session:
     def entry(self) -> dict[str, Any]:
         """What the history keeps: settings, and what the actions are where the environment says it."""
         settings = {k: v for k, v in vars(self.config).items() if k not in ("repo_id", "root") and v is not None}
-        entry = {"operation": "record", "target": self.config.repo_id, "settings": settings}
+        entry = {"operation": "record", "target": self.config.repo_id, "settings": settings, "told": told(settings)}
         plain = self.env.unwrapped
         kind = getattr(plain, "action_kind", None)
         if kind is None:
@@ -234,6 +234,12 @@ class _Session:
 
         pausing = getattr(self.teleoperator, "pausing", None)
         return {} if pausing is None else {IS_PAUSE: np.array([bool(pausing)])}
+
+
+def told(settings: Mapping[str, Any]) -> str:
+    """The sentence for the history, from the settings of a recording."""
+    said = f"Recorded scripted demonstrations in an environment until {settings['episodes']} had succeeded"
+    return f"{said}; the script pauses in {settings['pause_share']:.0%} of the time steps."
 
 
 def _columns(observation: dict[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from ..terminal.console import note
 from ..views.view import View
 from .rewrite import all_features, rewrite, traced_columns, write_bounds
 from .source import Source
-from .target import Target, new_dataset, write_history
+from .target import Target, new_dataset, skip_entry, write_history
 
 __all__ = ["Written", "pictures_unchanged", "write"]
 
@@ -127,7 +127,7 @@ def _frames(view: View, index: int) -> Iterator[tuple[dict[str, Any], str]]:
 def _finish(view: View, target: Target, kept: Sequence[int], done: Written) -> None:
     view.settle(kept)
     write_bounds(target.folder, view.bounds)
-    skipped = [{"operation": "skip_bad_episodes", "episodes": done.skipped}] if done.skipped else []
+    skipped = [skip_entry(done.skipped)] if done.skipped else []
     write_history(target.folder, [*view.history(), *skipped])
 
 

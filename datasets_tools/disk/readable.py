@@ -11,6 +11,7 @@ from ..decisions.joints import match_joints
 from ..terminal.console import note
 from ..views.view import DerivedView
 from .source import Source
+from .target import skip_entry
 
 __all__ = ["readable"]
 
@@ -60,8 +61,7 @@ def readable(source: Source, actions: str, *, skip_bad_episodes: bool, needs_vid
         raise DataError(f"{source.root}: not one episode can be read; the last one: {bad[max(bad)]}")
     view = Readable(source, readable=[i for i in source.episodes if i not in bad], said=_deltas(source, actions))
     if bad:
-        entry = {"operation": "skip_bad_episodes", "source": source.meta.repo_id, "episodes": bad}
-        view.entry.update(entry)
+        view.entry.update(skip_entry(bad), source=source.meta.repo_id)
     return view
 
 

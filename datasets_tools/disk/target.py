@@ -17,6 +17,7 @@ from lerobot.datasets.video_utils import StreamingVideoEncoder
 
 from lerobot_cqn.errors import ConfigError, OutputError, OutputExistsError
 from lerobot_cqn.schema import HISTORY, read_history
+from lerobot_cqn.story import numbered
 
 from ..terminal.console import note
 
@@ -29,6 +30,7 @@ __all__ = [
     "read_history",
     "refuse_existing",
     "refuse_inside",
+    "skip_entry",
     "write_history",
 ]
 
@@ -186,6 +188,12 @@ def write_history(folder: Path, operations: Sequence[Mapping[str, Any]]) -> None
     path = folder / HISTORY
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({"version": 1, "operations": list(operations)}, indent=2) + "\n")
+
+
+def skip_entry(episodes: Mapping[int, str]) -> dict[str, Any]:
+    """Entry of episodes that were left out since they could not be read: number -> reason."""
+    said = f"Left out {numbered(list(episodes))}, which could not be read."  # reasons are long
+    return {"operation": "skip_bad_episodes", "episodes": dict(episodes), "told": said}
 
 
 def append_history(folder: Path, previous: Path | None, entry: Mapping[str, Any]) -> None:

@@ -6,6 +6,7 @@ pictures are read one at a time while writing.
 
 import dataclasses
 import importlib
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -101,11 +102,11 @@ class _Skipped(list[tuple[str, str]]):
         note(f"Skipped {name}: {error}")
 
 
-def help() -> str:
+def help(summary: str) -> str:
     """Help page."""
     lines = [f"  {name:<17} {text}" for name, text in FORMATS.items()]
     formats = "\n".join(["Formats:", *lines, "More on each: docs/datasets.md."])
-    page = help_page("convert", "turn other formats into a LeRobotDataset v3", ConvertConfig, EXAMPLE, formats)
+    page = help_page("convert", summary, ConvertConfig, EXAMPLE, formats)
     return page.replace("--from_", "--from")
 
 
@@ -323,7 +324,7 @@ def _history_entry(
     local = (*SHARED, "task")
     settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in local}
     entry = _entry(config, source, settings | {"fps": reader.fps[0], "fps_from": reader.fps[1]})
-    return entry | {
+    entry |= {
         "total": {"episodes": len(written), "steps": sum(p.steps for p in written), **_totals(written)},
         "notes": reader.notes,
         "skipped": [{"source": name, "reason": why.replace(str(source), source.name)} for name, why in skipped],
@@ -332,6 +333,14 @@ def _history_entry(
             for i, p in enumerate(written)
         ],
     }
+    return entry | {"told": told(entry)}
+
+
+def told(entry: Mapping[str, Any]) -> str:
+    """The sentence for the history, from the entry of a conversion."""
+    total, skipped = entry["total"], entry.get("skipped")
+    said = f"Converted {entry['source']} from {entry['format']}: {total['episodes']} episodes, {total['steps']} steps"
+    return said + (f"; {len(skipped)} could not be taken over." if skipped else ".")
 
 
 def _entry(config: ConvertConfig, source: Path, settings: dict[str, Any]) -> dict[str, Any]:
@@ -358,7 +367,8 @@ def _convert_lerobot(config: ConvertConfig, source: Path, root: Path) -> None:
         return
     with converted_copy(source, root, config.new_repo_id) as folder:
         total = {"episodes": summary.episodes, "steps": summary.frames}
-        append_history(folder, source, _entry(config, source, {}) | {"total": total})
+        entry = _entry(config, source, {}) | {"total": total}
+        append_history(folder, source, entry | {"told": told(entry)})
 
 
 def _python_name(arg: str) -> str:

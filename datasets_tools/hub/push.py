@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 __all__ = ["PushConfig", "help", "main"]
 
-SUMMARY = "upload a dataset to the Hugging Face Hub, with a card that tells how it came about"
 EXAMPLE = """
 cqn-data push --repo_id=user/pick --root=data/pick_cqn --dry_run
 cqn-data push --repo_id=user/pick --root=data/pick_cqn --private --tags='[ur5e, click]'
@@ -36,9 +35,9 @@ class PushConfig(HubTarget):
     root: str | None = option(None, help="Folder of the dataset; by default LeRobot's home and the repo_id.")
 
 
-def help() -> str:
+def help(summary: str) -> str:
     """Help page."""
-    return help_page("push", SUMMARY, PushConfig, EXAMPLE, NOTES)
+    return help_page("push", summary, PushConfig, EXAMPLE, NOTES)
 
 
 def main(args: list[str]) -> None:

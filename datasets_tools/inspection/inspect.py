@@ -72,9 +72,9 @@ class Inspection:
         return not any(f.level == "error" for f in self.findings)
 
 
-def help() -> str:
+def help(summary: str) -> str:
     """Help page."""
-    return help_page("inspect", "look at a dataset before training", InspectConfig, EXAMPLE, NOTES)
+    return help_page("inspect", summary, InspectConfig, EXAMPLE, NOTES)
 
 
 def main(args: list[str]) -> int:

@@ -1,17 +1,18 @@
 """``cqn-data bounds``: the action range that training maps to [-1, 1], written where it reads it: meta/stats.json."""
 
 import dataclasses
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from ..terminal.console import note, table
 from ..terminal.options import option
-from .job import Step, help_for, main_for, settings_of
+from .job import Step, settings_of
 
 if TYPE_CHECKING:
     from ..views.bounded import Bounded
     from ..views.view import DerivedView, View
 
-__all__ = ["SetBounds", "help", "main"]
+__all__ = ["SetBounds"]
 
 
 @dataclasses.dataclass
@@ -19,7 +20,6 @@ class SetBounds(Step):
     """Settings of ``cqn-data bounds``."""
 
     name = "bounds"
-    summary = "set the action bounds that training scales by"
     example = """
 cqn-data bounds --repo_id=local/pick --root=data/pick --new_root=data/pick_bounded --quantile=0.001 --margin=0.1
 """
@@ -61,6 +61,14 @@ Merging and splitting with lerobot-edit-dataset does so, too.
         after.entry.update(settings=settings_of(self))
         return after
 
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """The sentence for the history."""
+        settings = entry["settings"]
+        inner = f"{100 * settings['quantile']:.4g}% of the steps left out at either end"
+        outer = f"{100 * settings['margin']:.4g}% of the range added there"
+        return f"Set the action bounds of {len(entry['bounds']['low'])} dimensions: {inner}, {outer}."
+
     def _show(self, view: "View", after: "Bounded") -> None:
         import numpy as np
 
@@ -83,13 +91,3 @@ Merging and splitting with lerobot-edit-dataset does so, too.
         constant = [n for n, a, b in zip(names, bounds.low, bounds.high, strict=True) if b - a <= 1e-8]
         if constant:
             note(f"Constant: {', '.join(constant)}; CQN maps such a dimension to 0 and back to its constant.")
-
-
-def help() -> str:
-    """Help page."""
-    return help_for(SetBounds)
-
-
-def main(args: list[str]) -> None:
-    """Run from the command line; errors as in ``run_job``."""
-    main_for(SetBounds, args)

@@ -1,11 +1,12 @@
 """``cqn-data delta``: absolute joint actions to delta joint actions on disk, and back. The maths: see ``deltas``."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 from ..terminal.console import note, result, table
 from ..terminal.options import option
-from .job import Step, help_for, main_for, settings_of
+from .job import Step, settings_of
 
 if TYPE_CHECKING:
     from lerobot_cqn.delta_actions import DeltaJoints
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     from ..views.episode import Episode
     from ..views.view import DerivedView, View
 
-__all__ = ["Delta", "help", "main"]
+__all__ = ["Delta"]
 
 
 @dataclasses.dataclass
@@ -21,7 +22,6 @@ class Delta(Step):
     """Settings of ``cqn-data delta``."""
 
     name = "delta"
-    summary = "turn absolute joint actions into delta joint actions, or back"
     example = """
 cqn-data delta --repo_id=local/pick --root=data/pick --new_root=data/pick_delta
 cqn-data delta --repo_id=local/pick_delta --root=data/pick_delta --new_root=data/pick_back --to=absolute
@@ -77,6 +77,14 @@ of the next step minus this one (the way back gives where the arm went, not what
         now = names if self.to == "delta" else None
         after.entry.update(settings=settings_of(self) | {"of": deltas.kind}, deltas=now)
         return after
+
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """The sentence for the history."""
+        kind = entry["settings"]["of"]
+        if not entry["deltas"]:
+            return f"Turned the delta actions of kind {kind} back into absolute ones."
+        return f"Turned absolute actions into deltas of kind {kind}, of {', '.join(entry['deltas']['action'])}."
 
     def _known(self, view: "View") -> "DeltaJoints":
         from lerobot_cqn.errors import ConfigError
@@ -143,13 +151,3 @@ def _show(view: "View") -> None:
         size, steps = size + np.abs(values).sum(axis=0), steps + len(values)
     rows = [[n, f"{a:.4g}", f"{b:.4g}", f"{c:.4g}"] for n, a, b, c in zip(names, low, high, size / steps, strict=True)]
     table(["dimension", "min", "max", "mean size"], rows)
-
-
-def help() -> str:
-    """Help page."""
-    return help_for(Delta)
-
-
-def main(args: list[str]) -> None:
-    """Run from the command line; errors as in ``run_job``."""
-    main_for(Delta, args)

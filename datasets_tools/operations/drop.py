@@ -1,16 +1,17 @@
 """``cqn-data drop``: leave out whole episodes, by number or by rule; the reason is kept in the history."""
 
 import dataclasses
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from ..terminal.console import result, table
 from ..terminal.options import option
-from .job import Step, help_for, main_for, settings_of
+from .job import Step, settings_of
 
 if TYPE_CHECKING:
     from ..views.view import DerivedView, View
 
-__all__ = ["Drop", "help", "main"]
+__all__ = ["Drop"]
 
 
 @dataclasses.dataclass
@@ -18,7 +19,6 @@ class Drop(Step):
     """Settings of ``cqn-data drop``."""
 
     name = "drop"
-    summary = "leave out whole episodes, by number or by rule"
     example = """
 cqn-data drop --repo_id=local/click --root=data/click --new_root=data/click_good \\
     --episodes='[3, 7]' --where='steps < 20' --reason='hand in the picture'
@@ -78,12 +78,14 @@ observation.state[gripper.pos], followed by .first, .last, .min, .max, .mean or 
         after.entry.update(settings=settings_of(self), dropped={str(k): v for k, v in dropped.items()})
         return after
 
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """The sentence for the history."""
+        from lerobot_cqn.story import numbered
 
-def help() -> str:
-    """Help page."""
-    return help_for(Drop)
-
-
-def main(args: list[str]) -> None:
-    """Run from the command line; errors as in ``run_job``."""
-    main_for(Drop, args)
+        dropped = entry["dropped"]
+        if not dropped:
+            return "Dropped no episode."
+        groups = {why: [i for i in dropped if dropped[i] == why] for why in dropped.values()}
+        reasons = "; ".join(f"{why}: {numbered(episodes)}" for why, episodes in groups.items())
+        return f"Dropped {len(dropped)} episode{'s' * (len(dropped) != 1)} ({reasons})."

@@ -1,17 +1,18 @@
 """``cqn-data filter``: leave out the time steps in which nothing moves. The rule and why it is safe: see ``pauses``."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from ..terminal.console import note, result, table
 from ..terminal.options import option
-from .job import Step, help_for, main_for, settings_of
+from .job import Step, settings_of
 
 if TYPE_CHECKING:
     from ..decisions.pauses import EpisodeReport, Rule
     from ..views.view import DerivedView, View
 
-__all__ = ["Filter", "help", "main"]
+__all__ = ["Filter"]
 
 
 @dataclasses.dataclass
@@ -19,7 +20,6 @@ class Filter(Step):
     """Settings of ``cqn-data filter``; units are those of the dataset (often radians, or degrees)."""
 
     name = "filter"
-    summary = "leave out the time steps in which nothing moves"
     example = """
 cqn-data filter --repo_id=local/click --root=data/click --auto --dry_run
 cqn-data filter --repo_id=local/click --root=data/click \\
@@ -112,6 +112,21 @@ Delta actions are formed anew, so that they connect the states that are left.
         )
         return after
 
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """The sentence for the history."""
+        from lerobot_cqn.story import numbered, shown
+
+        total = entry["total"]
+        gone, pauses = total["steps"] - total["kept"], sum(len(e["pauses"]) for e in entry["episodes"])
+        settings, left = entry["settings"], entry.get("left_out")
+        why = f" {settings['why'].rstrip('.')}." if settings.get("why") else ""
+        short = f" Left out {numbered(list(left))}, of which too little would be left." if left else ""
+        return (
+            f"Left out {gone} of {total['steps']} steps ({gone / total['steps']:.0%}), in {pauses} pauses in which"
+            f" nothing moves: below {shown(settings['threshold'])} a step.{why}{short}"
+        )
+
     def rule(self, view: "View") -> "tuple[Rule, dict[str, Any]]":
         """What a pause is in this dataset, and how an automatic threshold was decided."""
         from lerobot_cqn.errors import ConfigError, DataError, one_of
@@ -182,16 +197,6 @@ def _choose(view: "View", joints: tuple[int, ...]) -> tuple[float, dict[str, Any
     if not found.clear:
         note("Look at the histogram (cqn-data inspect) and give --threshold where you know better.")
     return found.threshold, {"why": found.reason, "clear": found.clear}
-
-
-def help() -> str:
-    """Help page."""
-    return help_for(Filter)
-
-
-def main(args: list[str]) -> None:
-    """Run from the command line; errors as in ``run_job``."""
-    main_for(Filter, args)
 
 
 def _show(reports: "list[EpisodeReport]") -> None:

@@ -5,7 +5,7 @@ The only place where operations, source and target meet; ``cqn-data OPERATION`` 
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -58,7 +58,6 @@ class Step:
     """An operation with its settings: a dataclass whose fields are options."""
 
     name: ClassVar[str]
-    summary: ClassVar[str]
     example: ClassVar[str]
     notes: ClassVar[str] = ""
 
@@ -74,6 +73,11 @@ class Step:
         """
         raise NotImplementedError
 
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """A sentence for people that says what was done, from the operation's own entry of the history; "" for none."""
+        return ""
+
 
 def main_for(step_class: type[Step], args: Sequence[str]) -> None:
     """Run one operation from its command line; errors as in :func:`run_job`."""
@@ -81,10 +85,10 @@ def main_for(step_class: type[Step], args: Sequence[str]) -> None:
     run_job(job, [step])
 
 
-def help_for(step_class: type[Step]) -> str:
-    """Help page of an operation."""
+def help_for(step_class: type[Step], summary: str) -> str:
+    """Help page of an operation that its summary describes in one line."""
     s = step_class
-    return help_page(s.name, s.summary, (s, Job), s.example, s.notes)
+    return help_page(s.name, summary, (s, Job), s.example, s.notes)
 
 
 def settings_of(step: Step) -> dict[str, Any]:
@@ -133,6 +137,8 @@ def run_job(job: Job, steps: Sequence[Step], name: str | None = None) -> list[di
             result(f"[{step.name}]")
         view = step.on(view)
         view.entry.update({"operation": step.name, "source": job.repo_id, "target": new_repo_id})
+        if sentence := step.told(view.entry):
+            view.entry["told"] = sentence
     _check_bounds(steps, view, source.bounds is not None)
     entries = view.history()[before:]
     if job.report:

@@ -1,11 +1,12 @@
 """``cqn-data label``: sparse rewards, done and success from a list, a column, a rule, or for all episodes."""
 
 import dataclasses
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from ..terminal.console import note, table
 from ..terminal.options import option
-from .job import Step, help_for, main_for, settings_of
+from .job import Step, settings_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     from ..views.episode import Episode
     from ..views.view import DerivedView, View
 
-__all__ = ["Label", "help", "main"]
+__all__ = ["Label"]
 
 
 @dataclasses.dataclass
@@ -21,7 +22,6 @@ class Label(Step):
     """Settings of ``cqn-data label``."""
 
     name = "label"
-    summary = "write sparse rewards: 1 on the last step of successful episodes"
     example = """
 cqn-data label --repo_id=local/pick --root=data/pick --new_root=data/pick_labelled --all
 cqn-data label --repo_id=local/pick --root=data/pick --new_root=data/pick_labelled --failed='[4, 11]'
@@ -72,6 +72,15 @@ Videos are copied as they are. Rules: QUANTITY OPERATOR NUMBER, see drop --help.
         after.entry.update(settings=settings_of(self), failures=[i for i, ok in successes.items() if not ok])
         return after
 
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """The sentence for the history."""
+        from lerobot_cqn.story import numbered
+
+        failed = entry["failures"]
+        which = f"every episode but {numbered(failed)}, which failed" if failed else "every episode; all are successes"
+        return f"Wrote sparse rewards: 1 on the last step of {which}."
+
     def _judge(self, view: "View") -> "Callable[[Episode], bool]":
         import numpy as np
 
@@ -100,13 +109,3 @@ Videos are copied as they are. Rules: QUANTITY OPERATOR NUMBER, see drop --help.
 
 def _short(numbers: "Sequence[str]") -> str:
     return ", ".join(numbers[:10]) + (", …" if len(numbers) > 10 else "")
-
-
-def help() -> str:
-    """Help page."""
-    return help_for(Label)
-
-
-def main(args: list[str]) -> None:
-    """Run from the command line; errors as in ``run_job``."""
-    main_for(Label, args)

@@ -1,16 +1,17 @@
 """``cqn-data resample``: fewer steps a second, e.g. 30 -> 10; no command or reward in between is lost."""
 
 import dataclasses
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from ..terminal.console import result
 from ..terminal.options import option
-from .job import Step, help_for, main_for, settings_of
+from .job import Step, settings_of
 
 if TYPE_CHECKING:
     from ..views.view import DerivedView, View
 
-__all__ = ["Resample", "help", "main"]
+__all__ = ["Resample"]
 
 
 @dataclasses.dataclass
@@ -18,7 +19,6 @@ class Resample(Step):
     """Settings of ``cqn-data resample``."""
 
     name = "resample"
-    summary = "take fewer steps a second"
     example = """
 cqn-data resample --repo_id=local/click --root=data/click --new_root=data/click_5hz --fps=5
 """
@@ -53,12 +53,9 @@ that they connect the states), the sum of the rewards in between, and done or su
         after.entry.update(settings=settings_of(self) | {"from_fps": view.fps}, total={"steps": old, "kept": new})
         return after
 
-
-def help() -> str:
-    """Help page."""
-    return help_for(Resample)
-
-
-def main(args: list[str]) -> None:
-    """Run from the command line; errors as in ``run_job``."""
-    main_for(Resample, args)
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """The sentence for the history."""
+        total, settings = entry["total"], entry["settings"]
+        rates = f"{settings['fps']} steps a second instead of {settings['from_fps']}"
+        return f"Took {rates}: {total['steps']} steps became {total['kept']}."

@@ -1,15 +1,16 @@
 """``cqn-data resize``: smaller pictures, e.g. 480x640 -> 84x84, cut out first where asked."""
 
 import dataclasses
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from ..terminal.console import note, table
-from .job import Step, help_for, main_for, settings_of
+from .job import Step, settings_of
 
 if TYPE_CHECKING:
     from ..views.view import DerivedView, View
 
-__all__ = ["Resize", "help", "main"]
+__all__ = ["Resize"]
 
 
 @dataclasses.dataclass
@@ -17,7 +18,6 @@ class Resize(Step):
     """Settings of ``cqn-data resize``."""
 
     name = "resize"
-    summary = "scale the pictures, and cut them out first where asked"
     example = """
 cqn-data resize --repo_id=local/pick --root=data/pick --new_root=data/pick_84 --size='[84, 84]'
 cqn-data resize --repo_id=local/pick --root=data/pick --new_root=data/pick_84 --size='[84, 84]' \\
@@ -88,6 +88,17 @@ alias. A camera may be named in full (observation.images.top) or by its last par
         after.entry.update(settings=settings_of(self))
         return after
 
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """The sentence for the history."""
+        from lerobot_cqn.story import shown
+
+        (height, width), crop = entry["settings"]["size"], entry["settings"].get("crop")
+        if not crop:
+            return f"Scaled the pictures to {height}x{width}."
+        parts = f"{shown(crop)}: top, left, height, width"
+        return f"Cut out parts of the pictures ({parts}), then scaled them to {height}x{width}."
+
 
 def _camera(view: "View", name: str) -> str:
     from lerobot_cqn.errors import ConfigError, one_of
@@ -96,13 +107,3 @@ def _camera(view: "View", name: str) -> str:
     if len(found) != 1:
         raise ConfigError(one_of("camera", name, view.cameras))
     return found[0]
-
-
-def help() -> str:
-    """Help page."""
-    return help_for(Resize)
-
-
-def main(args: list[str]) -> None:
-    """Run from the command line; errors as in ``run_job``."""
-    main_for(Resize, args)

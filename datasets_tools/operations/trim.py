@@ -1,17 +1,18 @@
 """``cqn-data trim``: cut the heads and tails of episodes, by steps, seconds, motion, or after the first success."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from ..terminal.console import table
 from ..terminal.options import option
-from .job import Step, help_for, main_for, settings_of
+from .job import Step, settings_of
 
 if TYPE_CHECKING:
     from ..views.episode import Episode
     from ..views.view import DerivedView, View
 
-__all__ = ["Trim", "help", "main"]
+__all__ = ["Trim"]
 
 
 @dataclasses.dataclass
@@ -19,7 +20,6 @@ class Trim(Step):
     """Settings of ``cqn-data trim``."""
 
     name = "trim"
-    summary = "cut heads and tails of episodes"
     example = """
 cqn-data trim --repo_id=local/click --root=data/click --new_root=data/click_trimmed --motion --auto --keep_still=5
 cqn-data trim --repo_id=local/click --root=data/click --head_seconds=0.5 --tail=3 --dry_run
@@ -107,6 +107,12 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
         after.entry.update(settings=settings_of(self), episodes=episodes)
         return after
 
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """The sentence for the history."""
+        head, tail = (sum(e[k] for e in entry["episodes"]) for k in ("head", "tail"))
+        return f"Cut {head} steps off the starts and {tail} off the ends of {len(entry['episodes'])} episodes."
+
     def _success(self, episode: "Episode") -> int | None:
         """First successful step, if there is one and it matters."""
         import numpy as np
@@ -135,13 +141,3 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
         # The step after the last motion holds the state it led to.
         first, last = start + int(moves[0]), start + int(moves[-1]) + 1
         return max(start, first - self.keep_still), min(stop, last + 1 + self.keep_still)
-
-
-def help() -> str:
-    """Help page."""
-    return help_for(Trim)
-
-
-def main(args: list[str]) -> None:
-    """Run from the command line; errors as in ``run_job``."""
-    main_for(Trim, args)

@@ -5,7 +5,8 @@ import sys
 
 import pytest
 
-from cqn_data.cli import OPERATIONS, main
+from cqn_data.cli import main
+from cqn_data.operations.registry import OPERATIONS
 
 
 def fails(capsys, *args):
