@@ -12,6 +12,9 @@ from collections.abc import Sequence
 from functools import partial
 from types import FrameType
 
+from lerobot_cqn.errors import ConfigError, one_of
+
+from .operations.job import help_for, main_for
 from .operations.registry import OPERATIONS, module_of, step_class
 from .terminal.console import Interrupted, explain, note, quiet, result
 
@@ -49,13 +52,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(name: str, args: list[str]) -> int:
     if name not in OPERATIONS:
-        from lerobot_cqn.errors import ConfigError, one_of
-
         raise ConfigError(one_of("operation", name, OPERATIONS))
     operation = OPERATIONS[name]
     if operation.step:
-        from .operations.job import help_for, main_for
-
         step = step_class(name)
         show, run = partial(help_for, step), partial(main_for, step)
     else:

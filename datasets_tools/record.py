@@ -11,6 +11,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from lerobot_cqn.errors import ConfigError, DataError, one_of
+
+from .disk.folders import local_root, refuse_existing
 from .terminal.console import Interrupted, load_lerobot, note, progress, result
 from .terminal.options import help_page, option, parse
 
@@ -48,8 +51,6 @@ class RecordConfig:
 
     def validate(self) -> None:
         """Check ranges; raises ConfigError naming the option, the range and the value."""
-        from lerobot_cqn.errors import ConfigError
-
         if self.episodes < 1:
             raise ConfigError(f"Expected --episodes >= 1, got {self.episodes}.")
         if not 0 <= self.pause_share < 1:
@@ -103,8 +104,7 @@ def record_dataset(config: RecordConfig, env_config: Any) -> None:
         Interrupted: Ctrl-C; the episodes before are saved.
     """
     config.validate()
-    from .disk.source import local_root
-    from .disk.target import new_dataset, refuse_existing, write_history
+    from .disk.target import new_dataset, write_history
 
     root = local_root(config.repo_id, config.root)
     refuse_existing(root)
@@ -180,8 +180,6 @@ class _Session:
 
     def explain(self, saved: int, root: str) -> None:
         """Raise what ended the recording early, naming what is on disk; nothing when it was complete."""
-        from lerobot_cqn.errors import DataError
-
         asked = self.config.episodes
         kept = f"{saved} of {asked} episodes are saved in {root}" if saved else "nothing was saved"
         if self.stopped():
@@ -273,8 +271,6 @@ def _env_config(args: list[str]) -> Any:
     from lerobot.envs.configs import EnvConfig
     from lerobot.utils.import_utils import register_third_party_plugins
 
-    from lerobot_cqn.errors import ConfigError, one_of
-
     register_third_party_plugins()
     for package in parse_plugin_args("discover_packages_path", args).values():
         try:
@@ -302,8 +298,6 @@ def _environment(env_config: Any) -> Iterator[Any]:
     """One environment, made by LeRobot itself so that whatever it can evaluate in can be recorded in."""
     from lerobot.envs.factory import make_env
 
-    from lerobot_cqn.errors import ConfigError
-
     try:
         with contextlib.redirect_stdout(None):
             suites = make_env(env_config, n_envs=1)
@@ -317,7 +311,6 @@ def _environment(env_config: Any) -> Iterator[Any]:
 
 
 def _teleoperator(env: Any, env_config: Any, config: RecordConfig) -> ScriptedTeleoperator:
-    from lerobot_cqn.errors import ConfigError
 
     make = getattr(env.unwrapped, "scripted_teleoperator", None)
     if make is None:

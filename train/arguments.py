@@ -19,6 +19,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.robots.config import RobotConfig
 from lerobot.teleoperators.config import TeleoperatorConfig
 
+from lerobot_cqn import configuration_cqn, configuration_drqv2, processors  # noqa: F401  # registers our policies
 from lerobot_cqn.errors import ConfigError, CQNError, one_of
 
 from .arm.devices import register_devices

@@ -19,8 +19,9 @@ from lerobot_cqn.errors import DataError
 
 from ..views.episode import SOURCE_EPISODE, SOURCE_FRAME, Bounds
 from ..views.view import View
+from .folders import new_folder
 from .source import NOT_NUMBERS, Source
-from .target import new_folder, write_history
+from .target import write_history
 
 __all__ = ["INDEX", "all_features", "rewrite", "traced_columns", "write_bounds"]
 

@@ -10,7 +10,7 @@ import pyarrow as pa
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import load_nested_dataset
-from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
+from lerobot.utils.constants import DEFAULT_FEATURES
 from numpy.typing import NDArray
 
 from lerobot_cqn.delta_actions import DeltaJoints, current_description, parse
@@ -18,19 +18,15 @@ from lerobot_cqn.errors import DataError
 
 from ..views.episode import Bounds, Camera, Episode
 from ..views.view import View
+from .folders import local_root
 from .pictures import shaped, video_pictures
 from .target import read_history
 
-__all__ = ["Source", "local_root", "open_source"]
+__all__ = ["Source", "open_source"]
 
 CACHE_BYTES = 256 * 2**20
 NOT_NUMBERS = ("image", "video", "language")  # what an episode does not hold in memory
 JITTER = 0.2  # share of a step by which a timestamp may be off
-
-
-def local_root(repo_id: str, root: str | None) -> Path:
-    """Dataset folder: ``root`` itself, else LeRobot's home with the repository name below it."""
-    return Path(root).expanduser() if root else Path(HF_LEROBOT_HOME) / repo_id
 
 
 class Source(View):

@@ -11,6 +11,9 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lerobot_cqn.errors import ConfigError, DataError, one_of
+
+from ..disk.folders import local_root, refuse_existing, refuse_inside
 from ..terminal.console import load_lerobot, note, progress, result, table
 from ..terminal.options import help_page, option, parse
 
@@ -66,8 +69,6 @@ class ConvertConfig:
 
     def validate(self) -> None:
         """Check names and ranges; raises ConfigError naming the option, and what is valid."""
-        from lerobot_cqn.errors import ConfigError, one_of
-
         if self.from_ not in FORMATS:
             raise ConfigError(one_of("--from", self.from_, FORMATS))
         if self.fps is not None and self.fps < 1:
@@ -112,8 +113,6 @@ def help(summary: str) -> str:
 
 def main(args: list[str]) -> None:
     """Run from the command line; errors as in :func:`convert_dataset`."""
-    from lerobot_cqn.errors import ConfigError
-
     try:
         config = parse(ConvertConfig, [_python_name(a) for a in args])
     except ConfigError as error:
@@ -129,15 +128,11 @@ def convert_dataset(config: ConvertConfig) -> None:
         DataError: the input is missing, empty, or damaged; names the file, the episode and the frame.
         OutputExistsError: the new folder exists already.
     """
-    from lerobot_cqn.errors import DataError
-
     config.validate()
     source = Path(config.input).expanduser()
     if not source.exists():
         raise DataError(f"Nothing found at --input={config.input}; expected a file or folder.")
     load_lerobot()
-    from ..disk.source import local_root
-    from ..disk.target import refuse_existing, refuse_inside
 
     root = local_root(config.new_repo_id, config.new_root)
     if not config.dry_run:
@@ -185,8 +180,6 @@ def _plan(config: ConvertConfig, reader: "Reader", skipped: _Skipped) -> tuple[l
         DataError: a damaged episode, or one of other columns than the first; with ``skip_bad_episodes`` only when
             nothing is left.
     """
-    from lerobot_cqn.errors import DataError
-
     plans: list[_Plan] = []
     features: dict[str, dict[str, Any]] = {}
     with progress() as bar:
@@ -213,8 +206,6 @@ def _features(config: ConvertConfig, episode: "Episode") -> dict[str, dict[str, 
         ConfigError: pictures too small for video.
         DataError: the first pictures cannot be read.
     """
-    from lerobot_cqn.errors import ConfigError
-
     features: dict[str, dict[str, Any]] = {
         key: {"dtype": str(values.dtype), "shape": values.shape[1:], "names": episode.names.get(key)}
         for key, values in episode.columns.items()
@@ -234,8 +225,6 @@ def _features(config: ConvertConfig, episode: "Episode") -> dict[str, dict[str, 
 
 def _compare(episode: "Episode", found: dict[str, dict[str, Any]], expected: dict[str, dict[str, Any]]) -> None:
     """Raise DataError where an episode has other columns or shapes than the first one."""
-    from lerobot_cqn.errors import DataError
-
     for key in {**expected, **found}:
         first, here = expected.get(key, {}).get("shape"), found.get(key, {}).get("shape")
         if first != here:
@@ -277,7 +266,6 @@ def _write(
     source: Path,
     root: Path,
 ) -> None:
-    from lerobot_cqn.errors import DataError
 
     from ..disk.target import append_history, new_dataset
     from ..views.episode import SOURCE_EPISODE, SOURCE_FRAME

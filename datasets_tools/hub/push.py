@@ -5,6 +5,8 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lerobot_cqn.errors import DataError
+
 from ..terminal.console import load_lerobot, note, result
 from ..terminal.options import help_page, option, parse
 from .options import HubTarget
@@ -99,7 +101,6 @@ def _files(root: Path) -> "dict[str, Path]":
 
 
 def _own_card(root: Path) -> str | None:
-    from lerobot_cqn.errors import DataError
 
     path = root / README
     if not path.is_file():
@@ -112,8 +113,6 @@ def _own_card(root: Path) -> str | None:
 
 def _merged_card(hub: "Hub", facts: "Facts", labels: "Labels", own: str | None) -> str:
     """The card from what lies in the folder or else on the Hub; says what it does to a card of a person."""
-    from lerobot_cqn.errors import DataError
-
     from .card import TOOL, write_card
     from .readme import Readme, start_mark
 

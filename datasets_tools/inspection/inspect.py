@@ -10,6 +10,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lerobot_cqn.errors import DataError, OutputExistsError
+from lerobot_cqn.schema import STATE
+
+from ..disk.folders import refuse_existing
 from ..terminal.console import load_lerobot, note, progress, result, table
 from ..terminal.options import help_page, option, parse
 
@@ -85,12 +89,9 @@ def main(args: list[str]) -> int:
         DataError: the dataset cannot be opened; with ``--strict`` the exit code is 1 instead.
         OutputExistsError: the page's file exists already.
     """
-    from lerobot_cqn.errors import DataError
-
     config = parse(InspectConfig, args)
     load_lerobot()
     from ..disk.source import open_source
-    from ..disk.target import refuse_existing
     from .checks import Finding
 
     page = config.page  # once: after it is written, the next free name is another one
@@ -122,8 +123,6 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
     """Measure and judge; what is damaged becomes a finding, and the rest is looked at all the same."""
     import numpy as np
 
-    from lerobot_cqn.schema import STATE
-
     from .cameras import look, missing_videos
     from .checks import Dataset, findings
     from .numbers import measure
@@ -152,7 +151,6 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
 
 
 def _write_page(path: Path, inspection: Inspection) -> None:
-    from lerobot_cqn.errors import OutputExistsError
 
     from .page import page
 

@@ -4,6 +4,9 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from lerobot_cqn.errors import ConfigError, DataError
+from lerobot_cqn.schema import dimension_names
+
 from ..terminal.console import note, table
 from ..terminal.options import option
 from .job import Step, settings_of
@@ -40,8 +43,6 @@ Merging and splitting with lerobot-edit-dataset does so, too.
 
     def validate(self) -> None:
         """Check ranges; raises ConfigError naming the option, the range and the value."""
-        from lerobot_cqn.errors import ConfigError
-
         if not 0 <= self.quantile < 0.5:
             raise ConfigError(f"Expected --quantile in [0, 0.5), got {self.quantile}.")
         if not 0 <= self.margin < float("inf"):
@@ -49,8 +50,6 @@ Merging and splitting with lerobot-edit-dataset does so, too.
 
     def on(self, view: "View") -> "DerivedView":
         """Compute the bounds and show them; raises DataError without actions."""
-        from lerobot_cqn.errors import DataError
-
         from ..views.bounded import Bounded
 
         if "action" not in view.features:
@@ -71,8 +70,6 @@ Merging and splitting with lerobot-edit-dataset does so, too.
 
     def _show(self, view: "View", after: "Bounded") -> None:
         import numpy as np
-
-        from lerobot_cqn.schema import dimension_names
 
         from ..views.bounded import actions, extremes
 

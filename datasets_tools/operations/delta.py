@@ -4,13 +4,15 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
+from lerobot_cqn.delta_actions import KINDS, DeltaJoints, Kind, description
+from lerobot_cqn.errors import ConfigError, DataError, one_of
+from lerobot_cqn.schema import ACTION, STATE, dimension_names
+
 from ..terminal.console import note, result, table
 from ..terminal.options import option
 from .job import Step, settings_of
 
 if TYPE_CHECKING:
-    from lerobot_cqn.delta_actions import DeltaJoints
-
     from ..views.episode import Episode
     from ..views.view import DerivedView, View
 
@@ -45,9 +47,6 @@ of the next step minus this one (the way back gives where the arm went, not what
 
     def validate(self) -> None:
         """Check choices; raises ConfigError naming the option and the valid values."""
-        from lerobot_cqn.delta_actions import KINDS
-        from lerobot_cqn.errors import ConfigError, one_of
-
         for name, valid in (("to", ("delta", "absolute")), ("of", ("auto", *KINDS))):
             if getattr(self, name) not in valid:
                 raise ConfigError(one_of(f"--{name}", getattr(self, name), valid))
@@ -58,8 +57,6 @@ of the next step minus this one (the way back gives where the arm went, not what
 
     def on(self, view: "View") -> "DerivedView":
         """Decide which dimensions are joints; raises ConfigError or DataError where that cannot be done."""
-        from lerobot_cqn.delta_actions import description
-
         from ..views.delta import AbsoluteView, DeltaView
 
         after: DerivedView
@@ -87,7 +84,6 @@ of the next step minus this one (the way back gives where the arm went, not what
         return f"Turned absolute actions into deltas of kind {kind}, of {', '.join(entry['deltas']['action'])}."
 
     def _known(self, view: "View") -> "DeltaJoints":
-        from lerobot_cqn.errors import ConfigError
 
         if view.deltas is None:
             raise ConfigError(
@@ -98,10 +94,6 @@ of the next step minus this one (the way back gives where the arm went, not what
 
     def _wanted(self, view: "View") -> "DeltaJoints":
         import numpy as np
-
-        from lerobot_cqn.delta_actions import DeltaJoints, Kind
-        from lerobot_cqn.errors import ConfigError, DataError, one_of
-        from lerobot_cqn.schema import ACTION, STATE, dimension_names
 
         from ..decisions.joints import gripper_dims, match_joints
 
@@ -137,8 +129,6 @@ of the next step minus this one (the way back gives where the arm went, not what
 def _show(view: "View") -> None:
     """Range of every dimension after the operation."""
     import numpy as np
-
-    from lerobot_cqn.schema import ACTION, dimension_names
 
     def actions(episode: "Episode") -> Any:
         return np.asarray(episode.columns[ACTION], np.float64)

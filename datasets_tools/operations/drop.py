@@ -4,6 +4,9 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from lerobot_cqn.errors import ConfigError, DataError
+from lerobot_cqn.story import numbered
+
 from ..terminal.console import result, table
 from ..terminal.options import option
 from .job import Step, settings_of
@@ -36,16 +39,12 @@ observation.state[gripper.pos], followed by .first, .last, .min, .max, .mean or 
 
     def validate(self) -> None:
         """Something must be asked for."""
-        from lerobot_cqn.errors import ConfigError
-
         if not self.episodes and not self.where:
             raise ConfigError("Nothing to drop: expected --episodes='[…]' or --where='RULE'.")
 
     def on(self, view: "View") -> "DerivedView":
         """Find the episodes; raises ConfigError for a number that is not there."""
         import numpy as np
-
-        from lerobot_cqn.errors import ConfigError, DataError
 
         from ..decisions.episode_rules import parse_rule
         from ..views.selected import Selected
@@ -81,8 +80,6 @@ observation.state[gripper.pos], followed by .first, .last, .min, .max, .mean or 
     @staticmethod
     def told(entry: Mapping[str, Any]) -> str:
         """The sentence for the history."""
-        from lerobot_cqn.story import numbered
-
         dropped = entry["dropped"]
         if not dropped:
             return "Dropped no episode."

@@ -2,8 +2,14 @@
 
 import dataclasses
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lerobot_cqn.errors import ConfigError, DataError, one_of
+from lerobot_cqn.schema import ACTION, STATE, dimension_names
+from lerobot_cqn.story import numbered, shown
+
+from ..disk.folders import refuse_existing
 from ..terminal.console import note, result, table
 from ..terminal.options import option
 from .job import Step, settings_of
@@ -65,12 +71,6 @@ Delta actions are formed anew, so that they connect the states that are left.
 
     def validate(self) -> None:
         """Check ranges; raises ConfigError naming the option, the range and the value."""
-        from pathlib import Path
-
-        from lerobot_cqn.errors import ConfigError, one_of
-
-        from ..disk.target import refuse_existing
-
         thresholds = [("threshold", 1.0 if self.threshold is None else self.threshold), *self.joint_thresholds.items()]
         for name, value in thresholds:
             if not 0 < value < float("inf"):
@@ -115,8 +115,6 @@ Delta actions are formed anew, so that they connect the states that are left.
     @staticmethod
     def told(entry: Mapping[str, Any]) -> str:
         """The sentence for the history."""
-        from lerobot_cqn.story import numbered, shown
-
         total = entry["total"]
         gone, pauses = total["steps"] - total["kept"], sum(len(e["pauses"]) for e in entry["episodes"])
         settings, left = entry["settings"], entry.get("left_out")
@@ -129,9 +127,6 @@ Delta actions are formed anew, so that they connect the states that are left.
 
     def rule(self, view: "View") -> "tuple[Rule, dict[str, Any]]":
         """What a pause is in this dataset, and how an automatic threshold was decided."""
-        from lerobot_cqn.errors import ConfigError, DataError, one_of
-        from lerobot_cqn.schema import ACTION, STATE, dimension_names
-
         from ..decisions.joints import gripper_dims
         from ..decisions.pauses import Rule
 
@@ -183,8 +178,6 @@ Delta actions are formed anew, so that they connect the states that are left.
 
 def _choose(view: "View", joints: tuple[int, ...]) -> tuple[float, dict[str, Any]]:
     """A threshold from the data, and why; the earlier one where the pauses it would be read from are gone."""
-    from lerobot_cqn.schema import STATE
-
     from ..decisions.pause_threshold import suggest
 
     for entry in reversed(view.history()):

@@ -9,6 +9,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from lerobot_cqn.delta_actions import KINDS
+from lerobot_cqn.errors import ConfigError, one_of
+
+from ..disk.folders import local_root, refuse_existing, refuse_inside
 from ..terminal.console import load_lerobot, note, progress, result
 from ..terminal.options import help_page, option, parse_all
 
@@ -45,9 +49,6 @@ class Job:
 
     def validate(self) -> None:
         """Check choices; raises ConfigError naming the option and the valid values."""
-        from lerobot_cqn.delta_actions import KINDS
-        from lerobot_cqn.errors import ConfigError, one_of
-
         if self.crf is not None and not 0 <= self.crf <= 63:
             raise ConfigError(f"Expected --crf in [0, 63], got {self.crf}.")
         if self.actions not in (valid := ("auto", "absolute", *KINDS)):
@@ -119,8 +120,7 @@ def run_job(job: Job, steps: Sequence[Step], name: str | None = None) -> list[di
     load_lerobot()
     from ..disk.encode import write
     from ..disk.readable import readable
-    from ..disk.source import local_root, open_source
-    from ..disk.target import refuse_existing, refuse_inside
+    from ..disk.source import open_source
 
     new_repo_id = job.new_repo_id or f"{job.repo_id}_{name or steps[0].name}"
     new_root = local_root(new_repo_id, job.new_root)
@@ -159,7 +159,6 @@ def run_job(job: Job, steps: Sequence[Step], name: str | None = None) -> list[di
 
 
 def _check_bounds(steps: Sequence[Step], view: "View", had_bounds: bool) -> None:
-    from lerobot_cqn.errors import ConfigError
 
     names = [step.name for step in steps]
     if "bounds" in names and view.bounds is None:

@@ -4,6 +4,9 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from lerobot_cqn.errors import ConfigError, one_of
+from lerobot_cqn.story import numbered
+
 from ..terminal.console import note, table
 from ..terminal.options import option
 from .job import Step, settings_of
@@ -45,8 +48,6 @@ Videos are copied as they are. Rules: QUANTITY OPERATOR NUMBER, see drop --help.
 
     def validate(self) -> None:
         """Exactly one way must be given."""
-        from lerobot_cqn.errors import ConfigError
-
         given = [n for n in ("all", "episodes", "failed", "column", "rule") if getattr(self, n)]
         if len(given) != 1:
             found = ", ".join(f"--{n}" for n in given) or "none"
@@ -75,16 +76,12 @@ Videos are copied as they are. Rules: QUANTITY OPERATOR NUMBER, see drop --help.
     @staticmethod
     def told(entry: Mapping[str, Any]) -> str:
         """The sentence for the history."""
-        from lerobot_cqn.story import numbered
-
         failed = entry["failures"]
         which = f"every episode but {numbered(failed)}, which failed" if failed else "every episode; all are successes"
         return f"Wrote sparse rewards: 1 on the last step of {which}."
 
     def _judge(self, view: "View") -> "Callable[[Episode], bool]":
         import numpy as np
-
-        from lerobot_cqn.errors import ConfigError, one_of
 
         from ..decisions.episode_rules import parse_rule
 

@@ -5,6 +5,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from lerobot_cqn.errors import ConfigError, one_of
+
 from ..terminal.options import help_page, parse
 from .job import Job, Step, run_job
 from .registry import STEPS, step_class
@@ -31,8 +33,6 @@ def help(summary: str) -> str:
 
 def main(args: list[str]) -> None:
     """Run from the command line; errors as in :func:`load_recipe` and ``run_job``."""
-    from lerobot_cqn.errors import ConfigError
-
     if not args or args[0].startswith("--"):
         raise ConfigError(f"Name a recipe first: cqn-data run FILE.yaml --…; shipped: {', '.join(_shipped())}.")
     changes = [
@@ -53,8 +53,6 @@ def load_recipe(name: str, changes: list[str] | None = None) -> list[Step]:
         ConfigError: no such file, not a recipe, or an unknown step or setting.
     """
     import yaml
-
-    from lerobot_cqn.errors import ConfigError, one_of
 
     path: Any = Path(name) if Path(name).is_file() else _shipped().get(name)
     if path is None:
@@ -93,8 +91,6 @@ def load_recipe(name: str, changes: list[str] | None = None) -> list[Step]:
 def _step(recipe: str, operation: str, given: dict[str, Any]) -> Step:
     import dataclasses
     import json
-
-    from lerobot_cqn.errors import ConfigError, one_of
 
     kind = step_class(operation)
     known = [f.name for f in dataclasses.fields(kind)]  # type: ignore[arg-type]

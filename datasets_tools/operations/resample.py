@@ -4,6 +4,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from lerobot_cqn.errors import ConfigError
+
 from ..terminal.console import result
 from ..terminal.options import option
 from .job import Step, settings_of
@@ -31,15 +33,11 @@ that they connect the states), the sum of the rewards in between, and done or su
 
     def validate(self) -> None:
         """Check ranges; raises ConfigError."""
-        from lerobot_cqn.errors import ConfigError
-
         if self.fps < 1:
             raise ConfigError(f"Expected --fps >= 1, got {self.fps}.")
 
     def on(self, view: "View") -> "DerivedView":
         """Raises ConfigError for a rate that would need frames that do not exist."""
-        from lerobot_cqn.errors import ConfigError
-
         from ..views.resampled import Resampled
 
         if self.fps >= view.fps:

@@ -4,6 +4,9 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from lerobot_cqn.errors import ConfigError, one_of
+from lerobot_cqn.story import shown
+
 from ..terminal.console import note, table
 from .job import Step, settings_of
 
@@ -40,8 +43,6 @@ alias. A camera may be named in full (observation.images.top) or by its last par
 
     def validate(self) -> None:
         """Check sizes; raises ConfigError naming the option, what was expected and what was found."""
-        from lerobot_cqn.errors import ConfigError
-
         if len(self.size) != 2 or not all(32 <= n <= 4096 for n in self.size):
             raise ConfigError(f"Expected --size='[HEIGHT, WIDTH]' with 32 to 4096 pixels each, got {self.size}.")
         if any(n % 2 for n in self.size):
@@ -52,8 +53,6 @@ alias. A camera may be named in full (observation.images.top) or by its last par
 
     def on(self, view: "View") -> "DerivedView":
         """Check crops against the pictures; raises ConfigError for an unknown camera or a box outside."""
-        from lerobot_cqn.errors import ConfigError
-
         from ..disk.pictures import picture_size
         from ..views.episode import Camera
         from ..views.resized import Resized
@@ -91,8 +90,6 @@ alias. A camera may be named in full (observation.images.top) or by its last par
     @staticmethod
     def told(entry: Mapping[str, Any]) -> str:
         """The sentence for the history."""
-        from lerobot_cqn.story import shown
-
         (height, width), crop = entry["settings"]["size"], entry["settings"].get("crop")
         if not crop:
             return f"Scaled the pictures to {height}x{width}."
@@ -101,7 +98,6 @@ alias. A camera may be named in full (observation.images.top) or by its last par
 
 
 def _camera(view: "View", name: str) -> str:
-    from lerobot_cqn.errors import ConfigError, one_of
 
     found = [k for k in view.cameras if name in (k, k.rsplit(".", 1)[-1])]
     if len(found) != 1:

@@ -4,6 +4,9 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from lerobot_cqn.errors import ConfigError, DataError
+from lerobot_cqn.schema import ACTION, NEXT_REWARD, NEXT_SUCCESS, STATE
+
 from ..terminal.console import table
 from ..terminal.options import option
 from .job import Step, settings_of
@@ -41,8 +44,6 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
 
     def validate(self) -> None:
         """Check ranges; raises ConfigError naming the option, the range and the value."""
-        from lerobot_cqn.errors import ConfigError
-
         for name in ("head", "tail", "head_seconds", "tail_seconds", "keep_still"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ConfigError(f"Expected --{name} >= 0, got {getattr(self, name)}.")
@@ -63,9 +64,6 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
     def on(self, view: "View") -> "DerivedView":
         """Find where each episode begins and ends; raises DataError where too little or a reward would be lost."""
         import numpy as np
-
-        from lerobot_cqn.errors import ConfigError, DataError
-        from lerobot_cqn.schema import NEXT_REWARD, NEXT_SUCCESS
 
         from ..decisions.rewards import carries_reward
         from ..views.selected import Selected
@@ -117,8 +115,6 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
         """First successful step, if there is one and it matters."""
         import numpy as np
 
-        from lerobot_cqn.schema import NEXT_REWARD, NEXT_SUCCESS
-
         if not self.after_success:
             return None
         columns = episode.columns
@@ -129,8 +125,6 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
     def _moving(self, episode: "Episode", start: int, stop: int, rule: Any) -> tuple[int, int]:
         """The part from the first motion to the last, with the still steps asked for around it."""
         import numpy as np
-
-        from lerobot_cqn.schema import ACTION, STATE
 
         from ..decisions.pauses import keep_mask
 

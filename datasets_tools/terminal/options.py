@@ -7,6 +7,8 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any
 
+from lerobot_cqn.errors import ConfigError, CQNError, one_of
+
 __all__ = ["help_page", "option", "parse", "parse_all"]
 
 
@@ -34,8 +36,6 @@ def parse_all(config_classes: Sequence[type], args: Sequence[str]) -> tuple[Any,
     Raises:
         ConfigError: unknown flag (with the nearest one), missing required flag, or a value of another type.
     """
-    from lerobot_cqn.errors import ConfigError, one_of
-
     owners = {f.name: (c, f) for c in config_classes for f in dataclasses.fields(c)}
     given: list[str] = []
     flags: dict[type, list[str]] = {c: [] for c in config_classes}
@@ -68,8 +68,6 @@ def parse_all(config_classes: Sequence[type], args: Sequence[str]) -> tuple[Any,
 def _decode(config_class: type, flags: list[str]) -> Any:
     import draccus
     from draccus.utils import DecodingError, ParsingError
-
-    from lerobot_cqn.errors import ConfigError, CQNError
 
     captured = io.StringIO()
     try:

@@ -72,6 +72,7 @@ def test_plugin_import_is_light():
         cwd=ROOT,
     ).stdout.split()
     assert "lerobot_cqn" in loaded
+    assert {"lerobot_cqn.configuration_cqn", "lerobot_cqn.configuration_drqv2", "lerobot_cqn.processors"} <= set(loaded)
     assert not rules.OPTIONAL & set(loaded)
 
 
