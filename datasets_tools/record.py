@@ -7,15 +7,15 @@ import contextlib
 import inspect
 import signal
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from lerobot_cqn.errors import ConfigError, DataError, one_of
+from lerobot_cqn.errors import ConfigError, DataError
 
 from .disk.folders import local_root, refuse_existing
 from .terminal.console import Interrupted, load_lerobot, note, progress, result
-from .terminal.options import help_page, option, parse
+from .terminal.options import help_page, option, parse, parse_choice, with_plugins
 
 __all__ = ["RecordConfig", "ScriptedTeleoperator", "help", "main", "record_dataset"]
 
@@ -79,7 +79,7 @@ class ScriptedTeleoperator(Protocol):
 
 def help(summary: str) -> str:
     """Help page."""
-    return help_page("record", summary, RecordConfig, EXAMPLE, NOTES)
+    return help_page("cqn-data record", summary, RecordConfig, EXAMPLE, NOTES)
 
 
 def main(args: list[str]) -> None:
@@ -87,7 +87,7 @@ def main(args: list[str]) -> None:
     config = parse(RecordConfig, [a for a in args if not a.startswith("--env.")])
     config.validate()
     load_lerobot()
-    record_dataset(config, _env_config([a for a in args if a.startswith("--env.")]))
+    record_dataset(config, env_config([a for a in args if a.startswith("--env.")]))
 
 
 def record_dataset(config: RecordConfig, env_config: Any) -> None:
@@ -265,32 +265,16 @@ def _task(env: Any, env_config: Any) -> str:
     return str(described or env_config.task or env_config.type).replace("_", " ")
 
 
-def _env_config(args: list[str]) -> Any:
-    """LeRobot's environment config from ``--env.*`` flags."""
-    from lerobot.configs.parser import PluginLoadError, load_plugin, parse_plugin_args
+def env_config(args: Sequence[str]) -> Any:
+    """LeRobot's environment config from ``--env.*`` options; raises ConfigError."""
     from lerobot.envs.configs import EnvConfig
     from lerobot.utils.import_utils import register_third_party_plugins
 
     register_third_party_plugins()
-    for package in parse_plugin_args("discover_packages_path", args).values():
-        try:
-            load_plugin(package)
-        except PluginLoadError as error:
-            raise ConfigError(str(error)) from error
-    flags = [a.removeprefix("--env.") for a in args if not a.startswith("--env.discover_packages_path")]
-    if any("=" not in flag for flag in flags):
+    settings = with_plugins(args)
+    if any("=" not in setting for setting in settings):
         raise ConfigError("Settings of the environment are written --env.NAME=VALUE.")
-    settings = dict(flag.split("=", 1) for flag in flags)
-    kind = settings.pop("type", "")
-    known = EnvConfig.get_known_choices()
-    if kind not in known:
-        raise ConfigError(
-            one_of("--env.type", kind, known) if kind else f"Missing --env.type=NAME; known: {', '.join(known)}."
-        )
-    try:
-        return parse(known[kind], [f"--{name}={value}" for name, value in settings.items()])
-    except ConfigError as error:
-        raise ConfigError(f"--env.type={kind}: {error}") from error
+    return parse_choice("env", EnvConfig, settings)
 
 
 @contextlib.contextmanager

@@ -107,7 +107,7 @@ def help(summary: str) -> str:
     """Help page."""
     lines = [f"  {name:<17} {text}" for name, text in FORMATS.items()]
     formats = "\n".join(["Formats:", *lines, "More on each: docs/datasets.md."])
-    page = help_page("convert", summary, ConvertConfig, EXAMPLE, formats)
+    page = help_page("cqn-data convert", summary, ConvertConfig, EXAMPLE, formats)
     return page.replace("--from_", "--from")
 
 

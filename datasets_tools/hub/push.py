@@ -39,7 +39,7 @@ class PushConfig(HubTarget):
 
 def help(summary: str) -> str:
     """Help page."""
-    return help_page("push", summary, PushConfig, EXAMPLE, NOTES)
+    return help_page("cqn-data push", summary, PushConfig, EXAMPLE, NOTES)
 
 
 def main(args: list[str]) -> None:

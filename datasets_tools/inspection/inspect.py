@@ -78,7 +78,7 @@ class Inspection:
 
 def help(summary: str) -> str:
     """Help page."""
-    return help_page("inspect", summary, InspectConfig, EXAMPLE, NOTES)
+    return help_page("cqn-data inspect", summary, InspectConfig, EXAMPLE, NOTES)
 
 
 def main(args: list[str]) -> int:

@@ -89,7 +89,7 @@ def main_for(step_class: type[Step], args: Sequence[str]) -> None:
 def help_for(step_class: type[Step], summary: str) -> str:
     """Help page of an operation that its summary describes in one line."""
     s = step_class
-    return help_page(s.name, summary, (s, Job), s.example, s.notes)
+    return help_page(f"cqn-data {s.name}", summary, (s, Job), s.example, s.notes)
 
 
 def settings_of(step: Step) -> dict[str, Any]:

@@ -28,7 +28,7 @@ def help(summary: str) -> str:
         "--STEP.OPTION=VALUE changes or adds a setting of a step; cqn-data STEP --help explains its options.\n\n"
         f"{shipped}"
     )
-    return help_page("run", summary, Job, EXAMPLE, notes)
+    return help_page("cqn-data run", summary, Job, EXAMPLE, notes)
 
 
 def main(args: list[str]) -> None:

@@ -148,7 +148,7 @@ def check_cqn_data(words: Sequence[str]) -> None:
         settings = [option for option in options if option.startswith("--env.")]
         if settings:
             assert operation == "record"
-            parsed.append(module._env_config(settings))
+            parsed.append(module.env_config(settings))
     for config in parsed:
         getattr(config, "validate", lambda: None)()
 
