@@ -64,7 +64,7 @@ class RecordConfig:
 
 
 class ScriptedTeleoperator(Protocol):
-    """What an environment's ``scripted_teleoperator(pause_share=, seed=)`` returns.
+    """The object that an environment's ``scripted_teleoperator(pause_share=, seed=)`` returns.
 
     With ``--tremor_rad`` it is called with ``tremor_rad=`` too. A teleoperator may have an attribute ``pausing``, bool:
     whether the last ``act`` was a pause.
@@ -216,7 +216,7 @@ class _Session:
         return success
 
     def entry(self) -> dict[str, Any]:
-        """What the history keeps: settings, and what the actions are where the environment says it."""
+        """Entry of the history: settings, and what the actions are where the environment says it."""
         settings = {k: v for k, v in vars(self.config).items() if k not in ("repo_id", "root") and v is not None}
         entry = {"operation": "record", "target": self.config.repo_id, "settings": settings, "told": told(settings)}
         plain = self.env.unwrapped

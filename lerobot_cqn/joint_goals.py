@@ -88,7 +88,7 @@ class RememberJointsProcessorStep(RelativeActionsProcessorStep):
         self._last_state = None
 
     def get_config(self) -> dict[str, Any]:
-        """Nothing is saved with the checkpoint but that the step is there."""
+        """No settings: the checkpoint keeps only that the step is there."""
         return {}
 
 
@@ -132,7 +132,7 @@ class DeltaToGoalProcessorStep(AbsoluteActionsProcessorStep):
         return changed
 
     def sent(self, goal: Tensor | None) -> None:
-        """Which goal [K, D] was really sent in this step; None: none was, and the next starts from the joints."""
+        """The goal [K, D] that was really sent in this step; None: none was, and the next starts from the joints."""
         self._goal = None if goal is None else goal.detach().clone()
 
     def action_of(self, goal: Tensor) -> Tensor:
@@ -144,7 +144,7 @@ class DeltaToGoalProcessorStep(AbsoluteActionsProcessorStep):
         return action_of(goal, state, before, self.deltas)
 
     def get_config(self) -> dict[str, Any]:
-        """What is saved with the checkpoint."""
+        """Settings that are saved with the checkpoint."""
         d = self.deltas
         return {"kind": d.kind, "action_dims": list(d.action_dims), "state_dims": list(d.state_dims)}
 
@@ -166,7 +166,7 @@ class DeltaToGoalProcessorStep(AbsoluteActionsProcessorStep):
 
 
 def converted_deltas(dataset_meta: Any) -> DeltaJoints | None:
-    """What `cqn-data delta` made of a dataset's absolute actions; None where the robot takes actions as they are.
+    """Deltas that `cqn-data delta` made of absolute actions; None where the robot takes actions as they are.
 
     dataset_meta: LeRobot's metadata (its folder `root`, and `features`); None: no dataset.
     Raises DataError for a damaged history, or one that names dimensions which the features do not have.

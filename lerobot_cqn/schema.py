@@ -51,7 +51,7 @@ HISTORY = Path("meta") / "cqn_history.json"  # in a dataset's folder: what was d
 
 @dataclass(frozen=True)
 class Observation:
-    """What the networks see at one time step.
+    """Observation that the networks see at one time step.
 
     pixels: one tensor [B, 3*S, H, W] per camera view, uint8 in [0, 255] or float in [0, 1], frames oldest
         first on the channels; empty for state-only policies. Views may differ in H and W.

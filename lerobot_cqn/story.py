@@ -1,4 +1,4 @@
-"""What ``meta/cqn_history.json`` holds, told in sentences for people; Markdown that shows any text as it is."""
+"""A dataset's history (``meta/cqn_history.json``) in sentences for people; Markdown that shows any text as it is."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

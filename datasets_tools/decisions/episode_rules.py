@@ -78,7 +78,7 @@ class Rule:
 
 
 def parse_rule(text: str, features: Mapping[str, Mapping[str, Any]]) -> Rule:
-    """Read a rule about the episodes of a dataset with these LeRobot features.
+    """A rule about the episodes of a dataset with these LeRobot features, from its text.
 
     Raises:
         ConfigError: not a rule, or a column or dimension that the dataset does not have.

@@ -23,7 +23,7 @@ KNOWN_META = {"info.json", "stats.json", "tasks.parquet", "cqn_history.json", "e
 
 @dataclass
 class Written:
-    """What is on disk now.
+    """State of the new dataset on disk.
 
     Attributes:
         episodes, frames: how many were written.

@@ -25,7 +25,7 @@ class Readable(DerivedView):
 
     @property
     def episodes(self) -> Sequence[int]:
-        """Readable ones."""
+        """Those that can be read."""
         return self.readable
 
     @property
@@ -35,7 +35,7 @@ class Readable(DerivedView):
 
 
 def readable(source: Source, actions: str, *, skip_bad_episodes: bool, needs_videos: bool) -> DerivedView:
-    """Read all numbers once, before any work begins.
+    """The episodes that can be read, of which all numbers are read once before any work begins.
 
     Args:
         source: the dataset.

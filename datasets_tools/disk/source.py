@@ -1,4 +1,4 @@
-"""Read a local LeRobotDataset v3 without ever touching it or the network."""
+"""A local LeRobotDataset v3, read without ever touching it or the network."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -68,7 +68,7 @@ class Source(View):
 
     @property
     def deltas(self) -> DeltaJoints | None:
-        """What the dataset's own history says about its actions; None where it says nothing."""
+        """Deltas of which the dataset's own history tells; None where it tells of none."""
         now = current_description(self.history())
         return None if now is None else parse(now, self.features, self.root)
 
@@ -84,7 +84,7 @@ class Source(View):
         return None
 
     def settle(self, written: Sequence[int]) -> None:
-        """Nothing depends on it here."""
+        """No-op: nothing here depends on what is written."""
 
     def history(self) -> list[dict[str, Any]]:
         """Operations that led to this dataset, as its own file tells."""
@@ -111,7 +111,7 @@ class Source(View):
                     raise DataError(f"Video file {path} of episode {episode} is missing; restore it.")
 
     def episode(self, index: int) -> Episode:
-        """Read the numbers and strings of one episode.
+        """Numbers and strings of one episode.
 
         Raises:
             DataError: the episode is empty or not where its metadata says, its timestamps do not fit the frame rate,

@@ -1,4 +1,4 @@
-"""What a format offers the converter: a reader of named episodes, with numbers at once and pictures one by one.
+"""Interface of a format to the converter: a reader of named episodes, with numbers at once and pictures one by one.
 
 T is the number of steps of one episode, H and W the pixels of a picture.
 """
@@ -49,7 +49,7 @@ REWARD_NAMES = {
 
 @dataclass(frozen=True)
 class Request:
-    """What the user asked of a format; empty tuples and None leave the choice to it.
+    """Request of the user to a format; empty tuples and None leave the choice to it.
 
     Attributes:
         input: existing file or folder.

@@ -174,7 +174,7 @@ def _convert(config: ConvertConfig, reader: "Reader", source: Path, root: Path) 
 
 
 def _plan(config: ConvertConfig, reader: "Reader", skipped: _Skipped) -> tuple[list[_Plan], dict[str, dict[str, Any]]]:
-    """Read every episode's numbers and first pictures; the first good episode tells the features.
+    """Plans of the good episodes, after a look at all numbers and first pictures; the first one tells the features.
 
     Raises:
         DataError: a damaged episode, or one of other columns than the first; with ``skip_bad_episodes`` only when
@@ -308,7 +308,7 @@ def _add(target: Any, episode: "Episode", plan: _Plan, swap_colors: bool) -> Non
 def _history_entry(
     config: ConvertConfig, reader: "Reader", written: list[_Plan], skipped: _Skipped, source: Path
 ) -> dict[str, Any]:
-    """What was done; folders of this machine stay out of it."""
+    """Entry of the history; folders of this machine stay out of it."""
     local = (*SHARED, "task")
     settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in local}
     entry = _entry(config, source, settings | {"fps": reader.fps[0], "fps_from": reader.fps[1]})

@@ -23,7 +23,7 @@ CONVERTED = {"data", "meta", "videos", "images"}
 
 
 class Summary:
-    """What ``meta/info.json`` of a v2.1 dataset declares.
+    """Declarations of a v2.1 dataset's ``meta/info.json``.
 
     Attributes:
         episodes, frames, fps: its totals.

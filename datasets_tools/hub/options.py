@@ -1,4 +1,4 @@
-"""Where on the Hub something goes, and how: the options that pushing a dataset and pushing a policy share."""
+"""Place and manner of a push: the options that pushing a dataset and pushing a policy share."""
 
 import dataclasses
 import re
@@ -44,7 +44,7 @@ class HubTarget:
 
 
 def check_repo_id(repo_id: str, option_name: str) -> None:
-    """Raises ConfigError where the Hub would not take a name; option_name: who gave it, for the message."""
+    """Check of a name; raises ConfigError where the Hub would not take it. option_name: of who gave it."""
     parts = repo_id.split("/")
     if len(parts) != 2 or not all(NAME.fullmatch(p) and "--" not in p and ".." not in p for p in parts):
         raise ConfigError(

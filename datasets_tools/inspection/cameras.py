@@ -1,4 +1,4 @@
-"""What ``cqn-data inspect`` sees of the cameras: a few pictures of each, spread over the recording."""
+"""Cameras as ``cqn-data inspect`` sees them: a few pictures of each, spread over the recording."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field

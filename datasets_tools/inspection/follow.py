@@ -1,4 +1,4 @@
-"""How actions and states belong together: absolute targets or differences, and how far the arm lags behind.
+"""Relation of actions and states: absolute targets or differences, and how far the arm lags behind.
 
 Shapes: T time steps of one episode, J joints that have an action and a state, L lags. In a dataset, action a[t] leads
 to state s[t+1]; a lag of 1 step is the shortest an arm can have.
@@ -103,7 +103,7 @@ class Follow:
         return self._gap / max(1, self._count)
 
     def kind(self) -> FollowKind:
-        """What the actions look like: positions, differences, or something else (end-effector poses, rates)."""
+        """Likely kind of the actions: positions, differences, or something else (end-effector poses, rates)."""
         level = _middle(self._level.value())
         answer = max(_middle(c.value()) for c in self._values)
         if level >= TRACKS or (level >= 0.5 and level > answer):

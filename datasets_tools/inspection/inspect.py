@@ -54,7 +54,7 @@ class InspectConfig:
 
     @property
     def page(self) -> Path | None:
-        """Where the page goes."""
+        """File of the page; None where none is written."""
         if self.html:
             return Path(self.html).expanduser()
         numbered = (Path(PAGE if n == 1 else f"{Path(PAGE).stem}_{n}.html") for n in itertools.count(1))

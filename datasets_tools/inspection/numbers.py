@@ -1,4 +1,4 @@
-"""What ``cqn-data inspect`` measures in states, actions and rewards. Episodes stream by; only sums are kept.
+"""Measures of ``cqn-data inspect`` on states, actions and rewards. Episodes stream by; only sums are kept.
 
 Shapes: T time steps of one episode, E episodes, S state dimensions, A action dimensions, J joints that have both.
 """

@@ -99,7 +99,7 @@ def overview(dataset: Dataset, numbers: Numbers, cameras: Sequence[CameraLook]) 
 
 
 def verdict(found: Sequence[Finding]) -> str:
-    """How many findings there are of each level."""
+    """Number of findings of each level, as a sentence."""
     counts = {level: sum(f.level == level for f in found) for level in LEVELS}
     listed = ", ".join(f"{n} {level}{'s' if n != 1 else ''}" for level, n in counts.items() if n)
     start = "Not ready for training" if counts["error"] else "Ready for training"
@@ -107,7 +107,7 @@ def verdict(found: Sequence[Finding]) -> str:
 
 
 def sentence_of_actions(numbers: Numbers) -> str:
-    """What the actions look like and how far the arm is behind; empty where they cannot be matched with states."""
+    """Kind of the actions and lag of the arm in a sentence; empty where they cannot be matched with states."""
     follow = numbers.follow
     if follow is None or not numbers.episodes:
         return ""

@@ -126,7 +126,7 @@ Delta actions are formed anew, so that they connect the states that are left.
         )
 
     def rule(self, view: "View") -> "tuple[Rule, dict[str, Any]]":
-        """What a pause is in this dataset, and how an automatic threshold was decided."""
+        """Rule of what a pause is in this dataset, and reasons for an automatic threshold."""
         from ..decisions.joints import gripper_dims
         from ..decisions.pauses import Rule
 

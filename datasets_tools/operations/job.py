@@ -24,7 +24,7 @@ __all__ = ["Job", "Step", "help_for", "main_for", "run_job", "settings_of"]
 
 @dataclasses.dataclass
 class Job:
-    """Where to read and write; the same for every operation, named as in ``lerobot-edit-dataset``."""
+    """Places to read and write; the same for every operation, named as in ``lerobot-edit-dataset``."""
 
     repo_id: str = option(help="Dataset to read, as user/name.")
     root: str | None = option(None, help="Its folder; by default LeRobot's home and the repo_id.")

@@ -43,7 +43,7 @@ def main(args: list[str]) -> None:
 
 
 def load_recipe(name: str, changes: list[str] | None = None) -> list[Step]:
-    """Read a recipe.
+    """Steps of a recipe.
 
     Args:
         name: a file, or the name of a shipped recipe.

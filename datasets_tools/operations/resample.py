@@ -37,7 +37,7 @@ that they connect the states), the sum of the rewards in between, and done or su
             raise ConfigError(f"Expected --fps >= 1, got {self.fps}.")
 
     def on(self, view: "View") -> "DerivedView":
-        """Raises ConfigError for a rate that would need frames that do not exist."""
+        """The view at the lower rate; raises ConfigError for one that would need frames that do not exist."""
         from ..views.resampled import Resampled
 
         if self.fps >= view.fps:

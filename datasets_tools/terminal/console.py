@@ -1,4 +1,4 @@
-"""What a person sees: result tables on stdout, progress and notes on stderr, no library chatter."""
+"""Output for a person: result tables on stdout, progress and notes on stderr, no library chatter."""
 
 import logging
 import os

@@ -40,7 +40,7 @@ def one_line(options: Callable[[], Iterable[str]], *, group: str = "", prefix: s
 
 
 def _user_cause(error: BaseException) -> BaseException:
-    """What a person can act on: a config's own check where there was one, else the field that did not parse."""
+    """The error that a person can act on: a config's own check if there was one, else the field that did not parse."""
     from draccus.utils import DecodingError, ParsingError
 
     chain: list[BaseException] = []

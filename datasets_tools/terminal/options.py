@@ -18,13 +18,13 @@ def option(default: Any = dataclasses.MISSING, *, help: str) -> Any:
 
 
 def parse[Config](config_class: type[Config], args: Sequence[str]) -> Config:
-    """Read flags into one dataclass; errors as in :func:`parse_all`."""
+    """One dataclass from flags; errors as in :func:`parse_all`."""
     config: Config = parse_all((config_class,), args)[0]
     return config
 
 
 def parse_all(config_classes: Sequence[type], args: Sequence[str]) -> tuple[Any, ...]:
-    """Read flags into dataclasses that share one command line.
+    """Dataclasses from flags that share one command line.
 
     Args:
         config_classes: dataclasses whose fields are made by :func:`option`; no name occurs twice.
@@ -69,7 +69,7 @@ def parse_all(config_classes: Sequence[type], args: Sequence[str]) -> tuple[Any,
 
 
 def parse_choice(group: str, registry: Any, args: Sequence[str]) -> Any:
-    """Read ``--GROUP.type=NAME --GROUP.OPTION=VALUE …`` into the dataclass that LeRobot knows by this name.
+    """The dataclass that LeRobot knows as NAME, from ``--GROUP.type=NAME --GROUP.OPTION=VALUE …``.
 
     Args:
         group: e.g. "env".

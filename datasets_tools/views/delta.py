@@ -29,7 +29,7 @@ class DeltaView(DerivedView):
 
     @property
     def deltas(self) -> DeltaJoints | None:
-        """What the actions are now."""
+        """Those that this view has made."""
         return self.made
 
     @property
@@ -53,7 +53,7 @@ class AbsoluteView(DerivedView):
 
     @property
     def deltas(self) -> DeltaJoints | None:
-        """None."""
+        """None: all actions are absolute."""
         return None
 
     @property

@@ -17,7 +17,7 @@ SOURCE_EPISODE, SOURCE_FRAME = "source.episode_index", "source.frame_index"
 
 @dataclass(frozen=True)
 class Camera:
-    """What becomes of a camera's pictures: cut out (top, left, height, width), then scaled to (height, width)."""
+    """Shape of a camera's pictures: cut out (top, left, height, width), then scaled to (height, width)."""
 
     crop: tuple[int, int, int, int] | None = None
     size: tuple[int, int] | None = None

@@ -17,7 +17,7 @@ class Resized(DerivedView):
 
     @property
     def cameras(self) -> dict[str, Camera]:
-        """What becomes of each camera's pictures."""
+        """Crop and size of each camera's pictures."""
         return self.shapes
 
     @property

@@ -40,12 +40,12 @@ class View(ABC):
     @property
     @abstractmethod
     def cameras(self) -> dict[str, Camera]:
-        """What becomes of each camera's pictures."""
+        """Crop and size of each camera's pictures, by feature."""
 
     @property
     @abstractmethod
     def deltas(self) -> DeltaJoints | None:
-        """Which action dimensions are differences and of what; None where all are absolute."""
+        """Action dimensions that are differences, and of what; None where all are absolute."""
 
     @property
     @abstractmethod
