@@ -43,8 +43,8 @@ def shown(value: Any) -> str:
 def plain(value: str) -> str:
     """One line that Markdown shows as it is and that closes no marker."""
     line = " ".join(value.split())
-    for character, shown in (("&", "&amp;"), ("<", "&lt;"), ("|", "\\|"), ("`", "\\`"), ("*", "\\*"), ("[", "\\[")):
-        line = line.replace(character, shown)
+    for character, escaped in (("&", "&amp;"), ("<", "&lt;"), ("|", "\\|"), ("`", "\\`"), ("*", "\\*"), ("[", "\\[")):
+        line = line.replace(character, escaped)
     return line
 
 

@@ -1,5 +1,7 @@
 """``cqn-data run``: several operations from a YAML recipe as one pass; frames are decoded once and encoded once."""
 
+import dataclasses
+import json
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -89,9 +91,6 @@ def load_recipe(name: str, changes: list[str] | None = None) -> list[Step]:
 
 
 def _step(recipe: str, operation: str, given: dict[str, Any]) -> Step:
-    import dataclasses
-    import json
-
     kind = step_class(operation)
     known = [f.name for f in dataclasses.fields(kind)]  # type: ignore[arg-type]
     for option in given:

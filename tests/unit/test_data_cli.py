@@ -71,6 +71,8 @@ def test_unknown_operation_names_the_nearest(capsys):
         (["--repo_id=a/b", "--treshold=1"], "Did you mean '--threshold'?"),
         ([], "Missing --repo_id"),
         (["--repo_id=a/b", "--threshold=abc"], "threshold"),
+        (["--repo_id=a/b", "--threshold.x=1"], "Did you mean '--threshold'?"),
+        (["--repo_id=a/b", "--joint_thresholds={a"], "Bad option value: while parsing a flow mapping"),
         (["--repo_id=a/b", "--threshold=-1"], "positive"),
         (["--repo_id=a/b", "--threshold=nan"], "positive"),
         (["--repo_id=a/b", "--threshold"], "needs a value"),
