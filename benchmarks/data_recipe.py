@@ -25,7 +25,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from cqn_data.disk.pictures import shaped, video_pictures
-from cqn_data.views.view import Camera
+from cqn_data.views.episode import Camera
 
 from .results_table import append
 

@@ -5,41 +5,20 @@ caller, 130 interrupted.
 Nothing heavy is imported here, so that ``--help`` answers at once.
 """
 
-import importlib
 import signal
 import sys
 import threading
 from collections.abc import Sequence
-from types import FrameType, ModuleType
+from functools import partial
+from types import FrameType
 
+from lerobot_cqn.errors import ConfigError, one_of
+
+from .operations.job import help_for, main_for
+from .operations.registry import OPERATIONS, module_of, step_class
 from .terminal.console import Interrupted, explain, note, quiet, result
 
-__all__ = ["OPERATIONS", "main", "module_of"]
-
-# Operation -> one line for --help. Its module offers help() and main(args); an int that main returns is the exit code.
-OPERATIONS = {
-    "convert": "turn RLBench, robomimic, ALOHA, diffusion_policy, NPZ or LeRobot v2.1 data into a LeRobotDataset v3",
-    "inspect": "look at a dataset before training: pauses, cameras, outliers, what is missing",
-    "record": "record scripted demonstrations in an environment, as teleoperation would",
-    "filter": "leave out the time steps in which nothing moves",
-    "trim": "cut heads and tails of episodes",
-    "delta": "turn absolute joint actions into delta joint actions, or back",
-    "resample": "take fewer steps a second",
-    "resize": "scale the pictures, and cut them out first where asked",
-    "label": "write sparse rewards: 1 on the last step of successful episodes",
-    "bounds": "set the action bounds that training scales by",
-    "drop": "leave out whole episodes, by number or by rule",
-    "run": "run several of these as one pass over the videos, from a recipe",
-    "push": "upload a dataset to the Hugging Face Hub, with a card that tells how it came about",
-}
-
-MODULES = {
-    "convert": "formats.convert",
-    "inspect": "inspection.inspect",
-    "record": "record",
-    "run": "operations.recipe",
-    "push": "hub.push",
-}
+__all__ = ["main"]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -73,20 +52,18 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(name: str, args: list[str]) -> int:
     if name not in OPERATIONS:
-        from lerobot_cqn.errors import ConfigError, one_of
-
         raise ConfigError(one_of("operation", name, OPERATIONS))
-    module = module_of(name)
+    operation = OPERATIONS[name]
+    if operation.step:
+        step = step_class(name)
+        show, run = partial(help_for, step), partial(main_for, step)
+    else:
+        module = module_of(name)
+        show, run = module.help, module.main
     if "-h" in args or "--help" in args:
-        result(module.help())
+        result(show(operation.summary))
         return 0
-    code = module.main(args)
-    return code if isinstance(code, int) else 0
-
-
-def module_of(name: str) -> ModuleType:
-    """The module of an operation."""
-    return importlib.import_module(f".{MODULES.get(name, f'operations.{name}')}", __package__)
+    return run(args) or 0
 
 
 def _overview() -> str:
@@ -97,7 +74,7 @@ def _overview() -> str:
             "",
             "Usage: cqn-data OPERATION --name=value ...",
             "",
-            *(f"  {name:<{width}}  {text}" for name, text in OPERATIONS.items()),
+            *(f"  {name:<{width}}  {operation.summary}" for name, operation in OPERATIONS.items()),
             "",
             "Example:",
             "  cqn-data filter --repo_id=local/click --root=data/click --dry_run=true",

@@ -7,12 +7,15 @@ import contextlib
 import inspect
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from lerobot_cqn.errors import ConfigError, DataError
+
+from .disk.folders import local_root, refuse_existing
 from .terminal.console import Interrupted, load_lerobot, note, progress, result
-from .terminal.options import help_page, option, parse
+from .terminal.options import help_page, option, parse, parse_choice, with_plugins
 
 __all__ = ["RecordConfig", "ScriptedTeleoperator", "help", "main", "record_dataset"]
 
@@ -48,8 +51,6 @@ class RecordConfig:
 
     def validate(self) -> None:
         """Check ranges; raises ConfigError naming the option, the range and the value."""
-        from lerobot_cqn.errors import ConfigError
-
         if self.episodes < 1:
             raise ConfigError(f"Expected --episodes >= 1, got {self.episodes}.")
         if not 0 <= self.pause_share < 1:
@@ -63,7 +64,7 @@ class RecordConfig:
 
 
 class ScriptedTeleoperator(Protocol):
-    """What an environment's ``scripted_teleoperator(pause_share=, seed=)`` returns.
+    """The object that an environment's ``scripted_teleoperator(pause_share=, seed=)`` returns.
 
     With ``--tremor_rad`` it is called with ``tremor_rad=`` too. A teleoperator may have an attribute ``pausing``, bool:
     whether the last ``act`` was a pause.
@@ -76,9 +77,9 @@ class ScriptedTeleoperator(Protocol):
         """Action for the environment's present state, (A,) float32."""
 
 
-def help() -> str:
+def help(summary: str) -> str:
     """Help page."""
-    return help_page("record", "record scripted demonstrations", RecordConfig, EXAMPLE, NOTES)
+    return help_page("cqn-data record", summary, RecordConfig, EXAMPLE, NOTES)
 
 
 def main(args: list[str]) -> None:
@@ -86,7 +87,7 @@ def main(args: list[str]) -> None:
     config = parse(RecordConfig, [a for a in args if not a.startswith("--env.")])
     config.validate()
     load_lerobot()
-    record_dataset(config, _env_config([a for a in args if a.startswith("--env.")]))
+    record_dataset(config, env_config([a for a in args if a.startswith("--env.")]))
 
 
 def record_dataset(config: RecordConfig, env_config: Any) -> None:
@@ -103,8 +104,7 @@ def record_dataset(config: RecordConfig, env_config: Any) -> None:
         Interrupted: Ctrl-C; the episodes before are saved.
     """
     config.validate()
-    from .disk.source import local_root
-    from .disk.target import new_dataset, refuse_existing, write_history
+    from .disk.target import new_dataset, write_history
 
     root = local_root(config.repo_id, config.root)
     refuse_existing(root)
@@ -180,8 +180,6 @@ class _Session:
 
     def explain(self, saved: int, root: str) -> None:
         """Raise what ended the recording early, naming what is on disk; nothing when it was complete."""
-        from lerobot_cqn.errors import DataError
-
         asked = self.config.episodes
         kept = f"{saved} of {asked} episodes are saved in {root}" if saved else "nothing was saved"
         if self.stopped():
@@ -218,9 +216,9 @@ class _Session:
         return success
 
     def entry(self) -> dict[str, Any]:
-        """What the history keeps: settings, and what the actions are where the environment says it."""
+        """Entry of the history: settings, and what the actions are where the environment says it."""
         settings = {k: v for k, v in vars(self.config).items() if k not in ("repo_id", "root") and v is not None}
-        entry = {"operation": "record", "target": self.config.repo_id, "settings": settings}
+        entry = {"operation": "record", "target": self.config.repo_id, "settings": settings, "told": told(settings)}
         plain = self.env.unwrapped
         kind = getattr(plain, "action_kind", None)
         if kind is None:
@@ -234,6 +232,12 @@ class _Session:
 
         pausing = getattr(self.teleoperator, "pausing", None)
         return {} if pausing is None else {IS_PAUSE: np.array([bool(pausing)])}
+
+
+def told(settings: Mapping[str, Any]) -> str:
+    """The sentence for the history, from the settings of a recording."""
+    said = f"Recorded scripted demonstrations in an environment until {settings['episodes']} had succeeded"
+    return f"{said}; the script pauses in {settings['pause_share']:.0%} of the time steps."
 
 
 def _columns(observation: dict[str, Any]) -> dict[str, Any]:
@@ -261,42 +265,22 @@ def _task(env: Any, env_config: Any) -> str:
     return str(described or env_config.task or env_config.type).replace("_", " ")
 
 
-def _env_config(args: list[str]) -> Any:
-    """LeRobot's environment config from ``--env.*`` flags."""
-    from lerobot.configs.parser import PluginLoadError, load_plugin, parse_plugin_args
+def env_config(args: Sequence[str]) -> Any:
+    """LeRobot's environment config from ``--env.*`` options; raises ConfigError."""
     from lerobot.envs.configs import EnvConfig
     from lerobot.utils.import_utils import register_third_party_plugins
 
-    from lerobot_cqn.errors import ConfigError, one_of
-
     register_third_party_plugins()
-    for package in parse_plugin_args("discover_packages_path", args).values():
-        try:
-            load_plugin(package)
-        except PluginLoadError as error:
-            raise ConfigError(str(error)) from error
-    flags = [a.removeprefix("--env.") for a in args if not a.startswith("--env.discover_packages_path")]
-    if any("=" not in flag for flag in flags):
+    settings = with_plugins(args)
+    if any("=" not in setting for setting in settings):
         raise ConfigError("Settings of the environment are written --env.NAME=VALUE.")
-    settings = dict(flag.split("=", 1) for flag in flags)
-    kind = settings.pop("type", "")
-    known = EnvConfig.get_known_choices()
-    if kind not in known:
-        raise ConfigError(
-            one_of("--env.type", kind, known) if kind else f"Missing --env.type=NAME; known: {', '.join(known)}."
-        )
-    try:
-        return parse(known[kind], [f"--{name}={value}" for name, value in settings.items()])
-    except ConfigError as error:
-        raise ConfigError(f"--env.type={kind}: {error}") from error
+    return parse_choice("env", EnvConfig, settings)
 
 
 @contextlib.contextmanager
 def _environment(env_config: Any) -> Iterator[Any]:
     """One environment, made by LeRobot itself so that whatever it can evaluate in can be recorded in."""
     from lerobot.envs.factory import make_env
-
-    from lerobot_cqn.errors import ConfigError
 
     try:
         with contextlib.redirect_stdout(None):
@@ -311,7 +295,6 @@ def _environment(env_config: Any) -> Iterator[Any]:
 
 
 def _teleoperator(env: Any, env_config: Any, config: RecordConfig) -> ScriptedTeleoperator:
-    from lerobot_cqn.errors import ConfigError
 
     make = getattr(env.unwrapped, "scripted_teleoperator", None)
     if make is None:

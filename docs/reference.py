@@ -18,9 +18,8 @@ from typing import Any
 
 from lerobot.envs.configs import EnvConfig
 
-from cqn_data.cli import OPERATIONS, module_of
 from cqn_data.operations.job import Job
-from cqn_data.operations.recipe import STEPS
+from cqn_data.operations.registry import OPERATIONS, STEPS, module_of
 from cqn_train import config as run
 from cqn_train import envs as _envs  # noqa: F401  # registers the environments
 from cqn_train.bench import cli as bench
@@ -324,8 +323,8 @@ def dataset_tools() -> list[str]:
         f"The same for {steps} and `run`.",
         options(rows(Job)),
     ]
-    for name, summary in OPERATIONS.items():
-        module = module_of(name)
+    for name, operation in OPERATIONS.items():
+        module, summary = module_of(name), operation.summary
         found = [rows(kind) for kind in vars(module).values() if _holds_options(kind, module.__name__)]
         parts += [f"### `cqn-data {name}`", summary[0].upper() + summary[1:] + "."]
         parts += [options(entries) for entries in found]

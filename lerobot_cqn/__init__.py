@@ -1,15 +1,20 @@
 """Coarse-to-fine Q-Network (Seo, Uruç, James 2024) as a LeRobot policy.
 
-Importing this package registers `--policy.type=cqn` and its baseline `--policy.type=drqv2` with LeRobot, and the
-processor step that their checkpoints name: LeRobot imports a policy's processors only when it makes new ones, not when
-it loads saved ones.
+Names that need PyTorch or LeRobot are imported on use, so that commands which need only the errors answer at once. The
+policies are registered with LeRobot by `lerobot_policy_cqn`, which its discovery imports, or by importing the modules
+of a configuration and of `processors`.
 """
 
-from .configuration_cqn import CQNConfig
-from .configuration_drqv2 import DrQv2Config
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from .errors import ConfigError, CQNError, DataError, OutputError, OutputExistsError
-from .processors import BoundObservationProcessorStep
 from .settings import DRQV2_PRESETS, PRESETS, CQNSettings, DrQv2Settings
+
+if TYPE_CHECKING:
+    from .configuration_cqn import CQNConfig
+    from .configuration_drqv2 import DrQv2Config
+    from .processors import BoundObservationProcessorStep
 
 __all__ = [
     "DRQV2_PRESETS",
@@ -25,3 +30,15 @@ __all__ = [
     "OutputError",
     "OutputExistsError",
 ]
+
+_ON_USE = {
+    "BoundObservationProcessorStep": "processors",
+    "CQNConfig": "configuration_cqn",
+    "DrQv2Config": "configuration_drqv2",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _ON_USE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f".{_ON_USE[name]}", __name__), name)

@@ -1,4 +1,4 @@
-"""What the configurations of all methods here share: fields, LeRobot's questions, saving."""
+"""Base of the configurations of all methods here: fields, LeRobot's questions, saving."""
 
 import json
 from dataclasses import asdict, dataclass, field, fields

@@ -52,7 +52,7 @@ class FitPicturesProcessorStep(ObservationProcessorStep):
         return changed
 
     def get_config(self) -> dict[str, Any]:
-        """What is saved with the checkpoint."""
+        """Settings that are saved with the checkpoint."""
         return {"shapes": {key: list(shape) for key, shape in self.shapes.items()}}
 
     def transform_features(self, features: Any) -> Any:

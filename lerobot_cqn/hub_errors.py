@@ -1,4 +1,4 @@
-"""What goes wrong between this machine and the Hub, and whether another try may go better."""
+"""Failures between this machine and the Hub, and whether another try may go better."""
 
 import httpx
 from huggingface_hub import constants, get_token
@@ -33,12 +33,12 @@ def refuse_to_start() -> None:
 
 
 def cause(error: BaseException) -> BaseException:
-    """What is behind the client's 'Error while uploading'."""
+    """The error behind the client's 'Error while uploading'."""
     return error.__cause__ if type(error) is RuntimeError and error.__cause__ is not None else error
 
 
 def passing(error: BaseException) -> str | None:
-    """What happened, where another try may go better."""
+    """A phrase on what happened, where another try may go better; else None."""
     if isinstance(error, HfHubHTTPError):
         status = error.response.status_code
         return f"The Hub answered {status}" if status in PASSING else None

@@ -1,14 +1,12 @@
 """From a policy's joint differences to an arm's absolute goals and back, in the robot's units.
 
-What a difference is, the dataset's history says: of a goal from the measured joints ("command", and "state", which is
-driven in the same way), or from the goal before ("command_steps"). Two steps do it around the policy, so that every
+What a difference is, the dataset's history says (`delta_actions`). Two steps do it around the policy, so that every
 command of LeRobot that drives a robot sends goals: one remembers the joints, the other adds the differences to them.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import torch
 from lerobot.processor import (
@@ -21,40 +19,17 @@ from lerobot.processor import (
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from .errors import DataError, one_of
-from .schema import ACTION, HISTORY, dimension_names, read_history
+from .delta_actions import DeltaJoints, Kind, current_description, parse
+from .errors import DataError
+from .schema import read_history
 
 __all__ = [
-    "DeltaJoints",
     "DeltaToGoalProcessorStep",
     "RememberJointsProcessorStep",
     "action_of",
     "converted_deltas",
     "goal_of",
 ]
-
-Kind = Literal["command", "command_steps", "state"]
-
-
-@dataclass(frozen=True)
-class DeltaJoints:
-    """Which action dimensions (J,) are differences, and the state dimensions (J,) of the same joints.
-
-    Raises DataError for an unknown kind, or where the two differ in number.
-    """
-
-    kind: Kind
-    action_dims: tuple[int, ...]
-    state_dims: tuple[int, ...]
-
-    def __post_init__(self) -> None:
-        if self.kind not in get_args(Kind):
-            raise DataError(one_of("kind of delta action", str(self.kind), get_args(Kind)))
-        if len(self.action_dims) != len(self.state_dims):
-            raise DataError(
-                f"Delta actions: expected a state for each joint, found {len(self.action_dims)} action and "
-                f"{len(self.state_dims)} state dimensions; write the dataset anew with `cqn-data delta`."
-            )
 
 
 def goal_of(action: Tensor, state: Tensor, last_goal: Tensor, deltas: DeltaJoints | None) -> Tensor:
@@ -113,7 +88,7 @@ class RememberJointsProcessorStep(RelativeActionsProcessorStep):
         self._last_state = None
 
     def get_config(self) -> dict[str, Any]:
-        """Nothing is saved with the checkpoint but that the step is there."""
+        """No settings: the checkpoint keeps only that the step is there."""
         return {}
 
 
@@ -157,7 +132,7 @@ class DeltaToGoalProcessorStep(AbsoluteActionsProcessorStep):
         return changed
 
     def sent(self, goal: Tensor | None) -> None:
-        """Which goal [K, D] was really sent in this step; None: none was, and the next starts from the joints."""
+        """The goal [K, D] that was really sent in this step; None: none was, and the next starts from the joints."""
         self._goal = None if goal is None else goal.detach().clone()
 
     def action_of(self, goal: Tensor) -> Tensor:
@@ -169,7 +144,7 @@ class DeltaToGoalProcessorStep(AbsoluteActionsProcessorStep):
         return action_of(goal, state, before, self.deltas)
 
     def get_config(self) -> dict[str, Any]:
-        """What is saved with the checkpoint."""
+        """Settings that are saved with the checkpoint."""
         d = self.deltas
         return {"kind": d.kind, "action_dims": list(d.action_dims), "state_dims": list(d.state_dims)}
 
@@ -191,7 +166,7 @@ class DeltaToGoalProcessorStep(AbsoluteActionsProcessorStep):
 
 
 def converted_deltas(dataset_meta: Any) -> DeltaJoints | None:
-    """What `cqn-data delta` made of a dataset's absolute actions; None where the robot takes actions as they are.
+    """Deltas that `cqn-data delta` made of absolute actions; None where the robot takes actions as they are.
 
     dataset_meta: LeRobot's metadata (its folder `root`, and `features`); None: no dataset.
     Raises DataError for a damaged history, or one that names dimensions which the features do not have.
@@ -199,21 +174,8 @@ def converted_deltas(dataset_meta: Any) -> DeltaJoints | None:
     if dataset_meta is None:
         return None
     root = Path(dataset_meta.root)
-    entries = [entry for entry in read_history(root) if "deltas" in entry]
+    history = read_history(root)
     # Differences that were recorded are what the environment itself takes.
-    recorded = [entry["deltas"] for entry in entries if entry.get("operation") == "record"]
-    now = entries[-1]["deltas"] if entries else None
-    if not now or now in recorded:
-        return None
-    try:
-        actions, states = (dimension_names(dataset_meta.features[key]) for key in (ACTION, OBS_STATE))
-        return DeltaJoints(
-            now["kind"],
-            tuple(actions.index(name) for name in now["action"]),
-            tuple(states.index(name) for name in now["state"]),
-        )
-    except (KeyError, ValueError, TypeError) as error:
-        raise DataError(
-            f"{root / HISTORY} does not fit the features ({error!r}): expected names of action and state dimensions; "
-            "write the dataset anew with `cqn-data delta`."
-        ) from error
+    recorded = [entry.get("deltas") for entry in history if entry.get("operation") == "record"]
+    now = current_description(history)
+    return None if now is None or now in recorded else parse(now, dataset_meta.features, root)

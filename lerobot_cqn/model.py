@@ -1,4 +1,4 @@
-"""What the networks of every method share: encoders of the camera views, augmentation, the averaged target."""
+"""Parts that the networks of every method share: encoders of the camera views, augmentation, the averaged target."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -90,7 +90,7 @@ class Evaluated:
 
 @dataclass(frozen=True)
 class Commands:
-    """What to type: each is a shell command over one or several lines."""
+    """Commands to type: each is a shell command over one or several lines."""
 
     evaluate: str
     go_on: str
@@ -98,7 +98,7 @@ class Commands:
 
 @dataclass(frozen=True)
 class ModelFacts:
-    """What a card says of a policy.
+    """Facts about a policy for its card.
 
     Attributes:
         repo_id: name on the Hub.
@@ -132,7 +132,7 @@ class ModelFacts:
 
 
 def data_facts(meta: Any, repo_id: str, episodes: Sequence[int] | None = None, *, public: bool = True) -> DataFacts:
-    """What LeRobot's metadata `meta` and the dataset's history say; episodes: those used, None: all.
+    """Facts that LeRobot's metadata `meta` and the dataset's history tell; episodes: those used, None: all.
 
     Raises DataError when the history is damaged.
     """
@@ -162,7 +162,7 @@ def commands(
     repo_id: str, *, env: Any = None, robot: Any = None, teleop: Any = None, dataset: str = "", fps: int | None = None,
     more: Sequence[str] = (),
 ) -> Commands:  # fmt: skip
-    """How to evaluate the policy `repo_id` and how to train on, where it was trained.
+    """Commands to evaluate the policy `repo_id` and to train on, where it was trained.
 
     env, robot, teleop: LeRobot's configurations, or None. dataset: its name, "" for none. fps: control steps a second
     of a robot, None: not known. more: options of the training that differ from what the policy's preset asks for.
@@ -182,7 +182,7 @@ def commands(
 
 
 def front_matter(facts: ModelFacts) -> dict[str, Any]:
-    """What the Hub reads: licence, library, tags, dataset, and the last result."""
+    """Front matter, which the Hub reads: licence, library, tags, dataset, and the last result."""
     results = None
     if facts.results:
         last = facts.results[-1]
@@ -368,7 +368,7 @@ def _files(facts: ModelFacts) -> str:
 
 
 def action_kind(changed: bool, *, any_changed: bool) -> str:
-    """What an action dimension is: `cqn-data delta` made differences of it, or left it, or nothing was converted."""
+    """Kind of an action dimension: `cqn-data delta` made differences of it, or left it, or nothing was converted."""
     return "joint difference" if changed else "absolute" if any_changed else "as the robot takes it"
 
 

@@ -63,7 +63,7 @@ class BoundObservationProcessorStep(ObservationProcessorStep):
         return bounded
 
     def get_config(self) -> dict[str, Any]:
-        """What is saved with the checkpoint."""
+        """Settings that are saved with the checkpoint."""
         return {"bound": self.bound}
 
     def transform_features(self, features: Any) -> Any:

@@ -18,12 +18,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Any, Self
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any, Self
 
 from .errors import DataError
+
+if TYPE_CHECKING:  # names and the history are needed by commands that answer at once
+    import torch
+    from torch import Tensor
 
 __all__ = [
     "ACTION",
@@ -32,6 +33,7 @@ __all__ = [
     "NEXT_DONE",
     "NEXT_REWARD",
     "NEXT_SUCCESS",
+    "STATE",
     "Batch",
     "Observation",
     "dimension_names",
@@ -39,6 +41,7 @@ __all__ = [
 ]
 
 ACTION = "action"
+STATE = "observation.state"
 NEXT_REWARD = "next.reward"
 NEXT_DONE = "next.done"
 NEXT_SUCCESS = "next.success"
@@ -48,17 +51,17 @@ HISTORY = Path("meta") / "cqn_history.json"  # in a dataset's folder: what was d
 
 @dataclass(frozen=True)
 class Observation:
-    """What the networks see at one time step.
+    """Observation that the networks see at one time step.
 
     pixels: one tensor [B, 3*S, H, W] per camera view, uint8 in [0, 255] or float in [0, 1], frames oldest
         first on the channels; empty for state-only policies. Views may differ in H and W.
     low_dim: normalised joints and environment state [B, S*P], oldest first; None for pixels-only policies.
     """
 
-    pixels: tuple[Tensor, ...] = ()
-    low_dim: Tensor | None = None
+    pixels: "tuple[Tensor, ...]" = ()
+    low_dim: "Tensor | None" = None
 
-    def to(self, device: torch.device | str) -> Self:
+    def to(self, device: "torch.device | str") -> Self:
         """Return the same observation on `device`."""
         low_dim = None if self.low_dim is None else self.low_dim.to(device, non_blocking=True)
         return type(self)(tuple(view.to(device, non_blocking=True) for view in self.pixels), low_dim)
@@ -75,13 +78,13 @@ class Batch:
     """
 
     observation: Observation
-    action: Tensor
-    reward: Tensor
-    discount: Tensor
+    action: "Tensor"
+    reward: "Tensor"
+    discount: "Tensor"
     next_observation: Observation
-    demo: Tensor
+    demo: "Tensor"
 
-    def to(self, device: torch.device | str) -> Self:
+    def to(self, device: "torch.device | str") -> Self:
         """Return the same batch on `device`."""
         return type(self)(
             observation=self.observation.to(device),

@@ -12,7 +12,7 @@ __all__ = ["DRQV2_PRESETS", "PRESETS", "CQNSettings", "CommonSettings", "DrQv2Se
 
 @dataclass(frozen=True)
 class CommonSettings:
-    """What every method here has: observation, networks, value distribution, losses, optimisation.
+    """Numbers that every method here has: observation, networks, value distribution, losses, optimisation.
 
     The defaults are the paper's RLBench column (table 2) unless a comment says otherwise.
     Raises ConfigError when a value is out of its range.

@@ -16,8 +16,9 @@ from lerobot.processor import (
 from numpy.typing import NDArray
 
 from lerobot_cqn.base_policy import RLPolicy
+from lerobot_cqn.delta_actions import DeltaJoints
 from lerobot_cqn.errors import DataError
-from lerobot_cqn.joint_goals import DeltaJoints, DeltaToGoalProcessorStep
+from lerobot_cqn.joint_goals import DeltaToGoalProcessorStep
 
 from .interfaces import Frame, Outcome
 

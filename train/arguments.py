@@ -1,17 +1,12 @@
 """The command line of `cqn-train`: from arguments to settings, and from a mistake to one line about it."""
 
-import contextlib
-import io
 import logging
-import re
 from collections.abc import Sequence
 from dataclasses import fields
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import draccus
-from draccus.utils import DecodingError, ParsingError
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError
 from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
@@ -19,7 +14,10 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.robots.config import RobotConfig
 from lerobot.teleoperators.config import TeleoperatorConfig
 
-from lerobot_cqn.errors import ConfigError, CQNError, one_of
+from cqn_data.terminal.mistakes import one_line
+from cqn_data.terminal.options import with_plugins
+from lerobot_cqn import configuration_cqn, configuration_drqv2, processors  # noqa: F401  # registers our policies
+from lerobot_cqn.errors import ConfigError
 
 from .arm.devices import register_devices
 from .config import DatasetSettings, EvalSettings, PageSettings, ReplaySettings, RunConfig, WandBSettings
@@ -86,7 +84,7 @@ def introduction() -> str:
 
 def parse(arguments: Sequence[str]) -> RunConfig:
     """Run settings from the command line. Raises ConfigError for anything that does not parse."""
-    arguments = ["--operator_page=true" if a == "--operator_page" else a for a in _with_plugins(arguments)]
+    arguments = ["--operator_page=true" if a == "--operator_page" else a for a in with_plugins(arguments)]
     if any(a.startswith(("--robot.", "--teleop.", "--resume")) for a in arguments):
         register_devices()
     config_file: str | None = None
@@ -106,35 +104,15 @@ def parse(arguments: Sequence[str]) -> RunConfig:
         settings = [a for a in arguments if a.startswith(f"--{kind}.")]
         if settings and config_file is None and parser.parse_arg(f"{kind}.type", arguments) is None:
             raise ConfigError(f"{settings[0]} needs to know of which {kind}: give --{kind}.type=... as well.")
-    complaint = io.StringIO()  # argparse prints pages of usage before it says what is wrong
-    try:
-        with contextlib.redirect_stderr(complaint):
-            config: RunConfig = draccus.parse(RunConfig, config_path=config_file, args=arguments)
-        if path is not None:
-            with contextlib.redirect_stderr(complaint):
-                config.policy = _pretrained_config(path, overrides)
-    except CQNError:
-        raise
-    except SystemExit as error:
-        raise ConfigError(_option_error(complaint.getvalue(), arguments)) from error
-    except Exception as error:  # draccus raises many kinds
-        raise ConfigError(_user_cause(error)) from error
+    with one_line(lambda: _options(arguments)):
+        config: RunConfig = draccus.parse(RunConfig, config_path=config_file, args=arguments)
+    if path is not None:
+        with one_line(lambda: _options(arguments), group="policy."):
+            config.policy = _pretrained_config(path, overrides)
     wanted = parser.parse_arg("device", overrides)
     if wanted and config.policy and config.policy.device != wanted:
         logger.warning("The device '%s' is not available: using '%s'.", wanted, config.policy.device)
     return config
-
-
-def _with_plugins(arguments: Sequence[str]) -> list[str]:
-    """The arguments without `--env.discover_packages_path=PACKAGE`, whose packages have registered what they hold."""
-    rest = list(arguments)
-    for flag, package in parser.parse_plugin_args(parser.PLUGIN_DISCOVERY_SUFFIX, rest).items():
-        try:
-            parser.load_plugin(package)
-        except parser.PluginLoadError as error:
-            raise ConfigError(f"--{flag}={package}: {error}") from error
-        rest = parser.filter_arg(flag, rest)
-    return rest
 
 
 def _pretrained_config(path: str, overrides: list[str]) -> PreTrainedConfig:
@@ -157,37 +135,6 @@ def _pretrained_config(path: str, overrides: list[str]) -> PreTrainedConfig:
 def _flag(arguments: Sequence[str], name: str) -> bool:
     value: Any = parser.parse_arg(name, list(arguments))
     return str(value).lower() in ("true", "1", "yes")
-
-
-def _user_cause(error: BaseException) -> str:
-    """What a person can act on: a config's own check where there was one, else the field that did not parse."""
-    chain: list[BaseException] = []
-    cause: BaseException | None = error
-    while cause is not None and cause not in chain:
-        chain.append(cause)
-        cause = cause.__cause__ or cause.__context__
-    ours = [e for e in chain if isinstance(e, CQNError)]
-    parsing = [e for e in chain if isinstance(e, DecodingError | ParsingError)]
-    wrapped = parsing and str(parsing[-1]).startswith("Couldn't instantiate")  # a check of LeRobot's own
-    said = (ours or ([] if wrapped else parsing[-1:]) or chain[-1:])[0]
-    return str(said) or type(said).__name__
-
-
-def _option_error(complaint: str, arguments: Sequence[str]) -> str:
-    """Argparse's pages in one line, with the nearest option or choice."""
-    text = (complaint.strip().splitlines() or ["unreadable options"])[-1].partition("error: ")[2]
-    choice = re.search(r"argument (\S+): invalid choice: '(.*?)' \(choose from (.*)\)", text)
-    if choice:
-        return one_of(f"value of {choice[1]}", choice[2], re.findall(r"[\w.-]+", choice[3]))
-    unknown = re.search(r"unrecognized arguments: (\S+)", text)
-    if unknown is None:
-        return f"{text} (--help lists all options)"
-    name = unknown[1].partition("=")[0]
-    if not any(a.startswith(name) for a in arguments):  # read as an override of a trained policy
-        name = name.replace("--", "--policy.", 1)
-    near = get_close_matches(name, _options(arguments), n=1)
-    hint = f" Did you mean '{near[0]}'?" if near else ""
-    return f"Unknown option '{name}': expected --name=value with a name that --help lists.{hint}"
 
 
 def _options(arguments: Sequence[str]) -> list[str]:

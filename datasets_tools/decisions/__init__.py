@@ -1,1 +1,1 @@
-"""What to keep, drop and change, as pure functions on arrays."""
+"""Decisions on steps, actions, rewards and episodes, as pure functions on arrays."""

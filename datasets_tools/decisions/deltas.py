@@ -1,7 +1,7 @@
 """Absolute and delta joint actions. Pure functions on arrays.
 
-Shapes: T time steps of one episode, J joints that are differences. a[t] is the commanded position of step t, s[t] the
-measured one before it. Three kinds of difference are in use:
+Shapes: T time steps of one episode, A action dimensions, J joints that are differences. a[t] is the commanded position
+of step t, s[t] the measured one before it. Three kinds of difference are in use:
 
 - ``command``: a[t] - s[t]. The reference implementation's on RLBench; executed as goal = measured + delta. Holds the
   lead of the command over the arm, hence the force of a contact. Each step stands for itself.
@@ -10,29 +10,18 @@ measured one before it. Three kinds of difference are in use:
   What was commanded cannot be had back from it, only where the arm went.
 """
 
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..views.view import Episode
+from lerobot_cqn.delta_actions import DeltaJoints, Kind
+from lerobot_cqn.schema import ACTION, STATE
 
-__all__ = ["KINDS", "Deltas", "Kind", "absolute_action", "delta_action", "select", "to_absolute", "to_delta"]
+__all__ = ["absolute_action", "delta_action", "to_absolute", "to_delta"]
 
 type Array = NDArray[np.float64]
-Kind = Literal["command", "command_steps", "state"]
-KINDS: tuple[str, ...] = get_args(Kind)
-STATE, ACTION = "observation.state", "action"
-
-
-@dataclass(frozen=True)
-class Deltas:
-    """Which action dimensions are differences: (J,) of the action, and the (J,) of the state they belong to."""
-
-    kind: Kind
-    action_dims: tuple[int, ...]
-    state_dims: tuple[int, ...]
 
 
 def to_delta(absolute: NDArray[Any], state: NDArray[Any], kind: Kind) -> Array:
@@ -60,37 +49,18 @@ def to_absolute(delta: NDArray[Any], state: NDArray[Any], kind: Kind) -> Array:
     return s[:1] + np.cumsum(d, axis=0) if kind == "command_steps" else s + d
 
 
-def delta_action(episode: Episode, deltas: Deltas) -> NDArray[Any]:
-    """(T, A) the episode's absolute actions with the chosen dimensions as differences, in their dtype."""
-    return _convert(episode, deltas, to_delta)
+def delta_action(columns: Mapping[str, Any], deltas: DeltaJoints) -> NDArray[Any]:
+    """(T, A) an episode's absolute actions with the chosen dimensions as differences, in their dtype."""
+    return _convert(columns, deltas, to_delta)
 
 
-def absolute_action(episode: Episode, deltas: Deltas) -> NDArray[Any]:
-    """(T, A) the episode's delta actions with all dimensions absolute, in their dtype."""
-    return _convert(episode, deltas, to_absolute)
+def absolute_action(columns: Mapping[str, Any], deltas: DeltaJoints) -> NDArray[Any]:
+    """(T, A) an episode's delta actions with all dimensions absolute, in their dtype."""
+    return _convert(columns, deltas, to_absolute)
 
 
-def select(
-    episode: Episode, rows: NDArray[np.int64], deltas: Deltas | None, action_rows: NDArray[np.int64] | None = None
-) -> Episode:
-    """Some rows of an episode, with delta actions formed anew so that they connect the states that are left.
-
-    Args:
-        episode: the steps before.
-        rows: (K,) ascending rows to keep.
-        deltas: what the actions are; None for absolute ones, which do not depend on their neighbours.
-        action_rows: (K,) where each step's command is taken from; by default its own row.
-    """
-    chosen = episode.at(rows)
-    if ACTION not in episode.columns or (deltas is None and action_rows is None):
-        return chosen
-    commanded = episode.columns[ACTION] if deltas is None else absolute_action(episode, deltas)
-    chosen = chosen.with_columns({ACTION: commanded[rows if action_rows is None else action_rows]})
-    return chosen if deltas is None else chosen.with_columns({ACTION: delta_action(chosen, deltas)})
-
-
-def _convert(episode: Episode, deltas: Deltas, function: Any) -> NDArray[Any]:
-    action: NDArray[Any] = np.array(episode.columns[ACTION], copy=True)
+def _convert(columns: Mapping[str, Any], deltas: DeltaJoints, function: Any) -> NDArray[Any]:
+    action: NDArray[Any] = np.array(columns[ACTION], copy=True)
     joints, own = list(deltas.action_dims), list(deltas.state_dims)
-    action[:, joints] = function(action[:, joints], episode.columns[STATE][:, own], deltas.kind)
+    action[:, joints] = function(action[:, joints], columns[STATE][:, own], deltas.kind)
     return action

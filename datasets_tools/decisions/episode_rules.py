@@ -7,7 +7,7 @@ the episode. A column of several dimensions without [NAME] stands for the one wi
 
 import operator
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,8 +15,6 @@ import numpy as np
 
 from lerobot_cqn.errors import ConfigError, one_of
 from lerobot_cqn.schema import NEXT_REWARD, NEXT_SUCCESS, dimension_names
-
-from ..views.view import Episode, View
 
 __all__ = ["Rule", "parse_rule"]
 
@@ -54,28 +52,33 @@ class Rule:
     compare: str
     value: float
 
-    def quantity(self, episode: Episode, fps: int) -> float:
-        """What the rule looks at."""
-        columns = episode.columns
+    def quantity(self, columns: Mapping[str, Any], steps: int, fps: int) -> float:
+        """The number that the rule compares.
+
+        Args:
+            columns: name -> array of an episode, ``steps`` rows each.
+            steps: of the episode.
+            fps: steps a second.
+        """
         if self.column == "steps":
-            return float(len(episode))
+            return float(steps)
         if self.column == "seconds":
-            return len(episode) / fps
+            return steps / fps
         if self.column == "return":
             return float(np.sum(columns[NEXT_REWARD]))
         if self.column == "success":
             return float(np.any(columns[NEXT_SUCCESS] if NEXT_SUCCESS in columns else columns[NEXT_REWARD] > 0))
-        values = np.asarray(columns[self.column], dtype=np.float64).reshape(len(episode), -1)
+        values = np.asarray(columns[self.column], dtype=np.float64).reshape(steps, -1)
         chosen = OVER[self.over](values)
         return float(chosen.max() if self.dim is None else chosen[self.dim])
 
-    def holds(self, episode: Episode, fps: int) -> bool:
-        """Whether the episode fulfils the rule."""
-        return COMPARE[self.compare](self.quantity(episode, fps), self.value)
+    def holds(self, columns: Mapping[str, Any], steps: int, fps: int) -> bool:
+        """Whether an episode fulfils the rule; arguments as of :meth:`quantity`."""
+        return COMPARE[self.compare](self.quantity(columns, steps, fps), self.value)
 
 
-def parse_rule(text: str, view: View) -> Rule:
-    """Read a rule about the episodes of ``view``.
+def parse_rule(text: str, features: Mapping[str, Mapping[str, Any]]) -> Rule:
+    """A rule about the episodes of a dataset with these LeRobot features, from its text.
 
     Raises:
         ConfigError: not a rule, or a column or dimension that the dataset does not have.
@@ -86,10 +89,10 @@ def parse_rule(text: str, view: View) -> Rule:
             f"Cannot read the rule '{text}': expected e.g. 'steps < 20' or 'observation.state[0].last > 1'."
         )
     column, dim = found["column"], found["dim"]
-    numbers = [k for k, f in view.features.items() if f["dtype"] not in ("string", "image", "video", "language")]
+    numbers = [k for k, f in features.items() if f["dtype"] not in ("string", "image", "video", "language")]
     if column in PLAIN:
         needs = {"return": (NEXT_REWARD,), "success": (NEXT_SUCCESS, NEXT_REWARD)}.get(column)
-        if needs and not any(k in view.features for k in needs):
+        if needs and not any(k in features for k in needs):
             raise ConfigError(
                 f"The rule '{text}' needs a column '{needs[0]}', which the dataset does not have; label it."
             )
@@ -99,7 +102,7 @@ def parse_rule(text: str, view: View) -> Rule:
         raise ConfigError(one_of("quantity of a rule", column, [*PLAIN, *numbers]))
     position: int | None = None
     if dim is not None:
-        names = dimension_names(view.features[column])
+        names = dimension_names(features[column])
         if dim not in names and not (dim.isdigit() and int(dim) < len(names)):
             raise ConfigError(one_of(f"dimension of '{column}'", dim, names))
         position = names.index(dim) if dim in names else int(dim)

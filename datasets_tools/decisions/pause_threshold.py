@@ -85,7 +85,7 @@ class Suggestion:
 
 @dataclass
 class Motion:
-    """What is remembered of all episodes: fixed histograms, however many steps there were."""
+    """Memory of all episodes: fixed histograms, however many steps there were."""
 
     _steps: Counts = field(default_factory=lambda: np.zeros(BINS + 1, np.int64))  # bin 0: did not move
     _joints: Counts = field(default_factory=lambda: np.zeros((0, BINS + 1), np.int64))  # changes of each joint

@@ -1,4 +1,4 @@
-"""Which time steps of a demonstration are pauses. Pure functions on arrays, no files.
+"""Pauses among the time steps of a demonstration. Pure functions on arrays, no files.
 
 Shapes: T time steps of one episode, S state dimensions, A action dimensions. Units are those of the dataset.
 
@@ -57,7 +57,7 @@ class Rule:
 
 @dataclass(frozen=True)
 class EpisodeReport:
-    """What happened to one episode.
+    """Outcome for one episode.
 
     Attributes:
         runs: (first step, length) of the dropped pauses.

@@ -14,7 +14,7 @@ from ..terminal.console import note
 from ..views.view import View
 from .rewrite import all_features, rewrite, traced_columns, write_bounds
 from .source import Source
-from .target import Target, new_dataset, write_history
+from .target import Target, new_dataset, skip_entry, write_history
 
 __all__ = ["Written", "pictures_unchanged", "write"]
 
@@ -23,7 +23,7 @@ KNOWN_META = {"info.json", "stats.json", "tasks.parquet", "cqn_history.json", "e
 
 @dataclass
 class Written:
-    """What is on disk now.
+    """State of the new dataset on disk.
 
     Attributes:
         episodes, frames: how many were written.
@@ -38,12 +38,13 @@ class Written:
 
 
 def write(
-    view: View, repo_id: str, root: Path, bar: Progress, *, skip: bool = False, crf: int | None = None
+    view: View, source: Source, repo_id: str, root: Path, bar: Progress, *, skip: bool = False, crf: int | None = None
 ) -> Written:
     """Write ``view`` to ``root``, complete or not at all.
 
     Args:
         view: what is left after the last operation.
+        source: the dataset at the bottom of it.
         repo_id: name of the new dataset.
         root: its folder, which must not exist.
         bar: progress to show.
@@ -60,15 +61,14 @@ def write(
     empty = [i for i, n in lengths.items() if n == 0]
     if empty:
         raise DataError(f"Nothing would be left of episode {', '.join(map(str, empty[:5]))}; drop it instead.")
-    if pictures_unchanged(view):
-        rewrite(view, repo_id, root, bar)
-        return Written(len(lengths), sum(lengths.values()), copied=bool(view.source.meta.video_keys))
-    return _encode(view, repo_id, root, bar, lengths, skip=skip, crf=crf)
+    if pictures_unchanged(view, source):
+        rewrite(view, source, root, bar)
+        return Written(len(lengths), sum(lengths.values()), copied=bool(source.meta.video_keys))
+    return _encode(view, source, repo_id, root, bar, lengths, skip=skip, crf=crf)
 
 
-def pictures_unchanged(view: View) -> bool:
+def pictures_unchanged(view: View, source: Source) -> bool:
     """Whether every frame of every episode stays, as it is and where it is."""
-    source = view.source
     if view.cameras != source.cameras or view.fps != source.fps:
         return False
     if list(view.episodes) != list(source.episodes):
@@ -77,9 +77,17 @@ def pictures_unchanged(view: View) -> bool:
 
 
 def _encode(
-    view: View, repo_id: str, root: Path, bar: Progress, lengths: dict[int, int], *, skip: bool, crf: int | None
+    view: View,
+    source: Source,
+    repo_id: str,
+    root: Path,
+    bar: Progress,
+    lengths: dict[int, int],
+    *,
+    skip: bool,
+    crf: int | None,
 ) -> Written:
-    source, done = view.source, Written()
+    done = Written()
     _refuse_unknown_kinds(source)
     features = {k: {n: v for n, v in f.items() if n != "info"} for k, f in all_features(view).items()}
     _note_losses(source)
@@ -112,14 +120,14 @@ def _frames(view: View, index: int) -> Iterator[tuple[dict[str, Any], str]]:
     """The steps of an episode as LeRobot frames."""
     episode, columns = view.episode(index), traced_columns(view, index)
     rows = np.arange(len(episode))
-    for row, pictures in enumerate(view.source.camera_frames(episode, rows, view.cameras)):
+    for row, pictures in enumerate(view.camera_frames(episode, rows)):
         yield {**{k: v[row] for k, v in columns.items()}, **pictures}, episode.tasks[row]
 
 
 def _finish(view: View, target: Target, kept: Sequence[int], done: Written) -> None:
     view.settle(kept)
     write_bounds(target.folder, view.bounds)
-    skipped = [{"operation": "skip_bad_episodes", "episodes": done.skipped}] if done.skipped else []
+    skipped = [skip_entry(done.skipped)] if done.skipped else []
     write_history(target.folder, [*view.history(), *skipped])
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -10,11 +11,19 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.errors import DataError
 
-from ..views.view import Camera
+from ..views.episode import Camera
 
-__all__ = ["shaped", "video_pictures"]
+__all__ = ["picture_size", "shaped", "video_pictures"]
 
 type Picture = NDArray[np.uint8]
+
+
+def picture_size(feature: dict[str, Any]) -> tuple[int, int]:
+    """Height and width of a camera's pictures, whichever axis its channels are."""
+    shape, names = feature["shape"], feature.get("names")
+    channels_first = names[0] in ("channels", "channel") if isinstance(names, list) else shape[0] in (1, 3)
+    height, width = shape[1:] if channels_first else shape[:2]
+    return int(height), int(width)
 
 
 def video_pictures(

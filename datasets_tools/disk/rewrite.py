@@ -17,9 +17,11 @@ from rich.progress import Progress
 
 from lerobot_cqn.errors import DataError
 
-from ..views.view import SOURCE_EPISODE, SOURCE_FRAME, Bounds, View
+from ..views.episode import SOURCE_EPISODE, SOURCE_FRAME, Bounds
+from ..views.view import View
+from .folders import new_folder
 from .source import NOT_NUMBERS, Source
-from .target import new_folder, write_history
+from .target import write_history
 
 __all__ = ["INDEX", "all_features", "rewrite", "traced_columns", "write_bounds"]
 
@@ -41,18 +43,17 @@ def traced_columns(view: View, index: int) -> dict[str, Any]:
     return {SOURCE_EPISODE: np.full_like(frames, episode.index), SOURCE_FRAME: frames} | episode.columns
 
 
-def rewrite(view: View, repo_id: str, root: Path, bar: Progress) -> None:
-    """Write ``view`` to ``root``; every frame of the source must still be in it.
+def rewrite(view: View, source: Source, root: Path, bar: Progress) -> None:
+    """Write ``view`` of ``source`` to ``root``; every frame of the source must still be in it.
 
     Raises:
         DataError: a file of the source cannot be read.
         OutputExistsError: something is at ``root``.
     """
-    source = view.source
     _refuse_cut_videos(source)
     with new_folder(root) as folder:
         _copy_rest(source.root, folder, bar)
-        stats = _write_numbers(view, folder, bar)
+        stats = _write_numbers(view, source, folder, bar)
         _write_episodes(source, folder, stats)
         old = {k: v for k, v in (source.meta.stats or {}).items() if k in view.features or "." not in k}
         write_stats({**old, **aggregate_stats(list(stats.values()))}, folder)
@@ -95,10 +96,9 @@ def _copy_rest(source: Path, folder: Path, bar: Progress) -> None:
         shutil.copyfile(path, copy)
 
 
-def _write_numbers(view: View, folder: Path, bar: Progress) -> dict[int, Stats]:
+def _write_numbers(view: View, source: Source, folder: Path, bar: Progress) -> dict[int, Stats]:
     """The data files, in the source's own partition; returns each episode's statistics of the numbers."""
-    source = view.source
-    features = {**view.source.meta.features, **all_features(view)}
+    features = {**source.meta.features, **all_features(view)}
     schema = get_hf_features_from_features(features)
     numbers = {k: f for k, f in all_features(view).items() if f["dtype"] not in NOT_NUMBERS}
     stats: dict[int, Stats] = {}

@@ -1,7 +1,7 @@
-"""Read a local LeRobotDataset v3 without ever touching it or the network."""
+"""A local LeRobotDataset v3, read without ever touching it or the network."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,27 +10,23 @@ import pyarrow as pa
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import load_nested_dataset
-from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
+from lerobot.utils.constants import DEFAULT_FEATURES
 from numpy.typing import NDArray
 
+from lerobot_cqn.delta_actions import DeltaJoints, current_description, parse
 from lerobot_cqn.errors import DataError
-from lerobot_cqn.schema import dimension_names
 
-from ..decisions.deltas import KINDS, Deltas
-from ..views.view import Bounds, Camera, Episode, View
+from ..views.episode import Bounds, Camera, Episode
+from ..views.view import View
+from .folders import local_root
 from .pictures import shaped, video_pictures
 from .target import read_history
 
-__all__ = ["Source", "local_root", "open_source"]
+__all__ = ["Source", "open_source"]
 
 CACHE_BYTES = 256 * 2**20
 NOT_NUMBERS = ("image", "video", "language")  # what an episode does not hold in memory
 JITTER = 0.2  # share of a step by which a timestamp may be off
-
-
-def local_root(repo_id: str, root: str | None) -> Path:
-    """Dataset folder: ``root`` itself, else LeRobot's home with the repository name below it."""
-    return Path(root).expanduser() if root else Path(HF_LEROBOT_HOME) / repo_id
 
 
 class Source(View):
@@ -48,11 +44,6 @@ class Source(View):
                 f"{root}: meta/info.json declares {meta.total_frames} frames, the parquet files hold"
                 f" {len(self.rows)}; record or download the dataset again."
             )
-
-    @property
-    def source(self) -> "Source":
-        """Itself."""
-        return self
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:
@@ -76,27 +67,10 @@ class Source(View):
         return {k: Camera() for k in (*self.meta.video_keys, *self.meta.image_keys) if k not in self.meta.depth_keys}
 
     @property
-    def deltas(self) -> Deltas | None:
-        """What the dataset's own history says about its actions; None where it says nothing."""
-        for entry in reversed(self.history()):
-            if "deltas" in entry:
-                return self.named_deltas(entry["deltas"]) if entry["deltas"] else None
-        return None
-
-    def named_deltas(self, described: dict[str, Any]) -> Deltas:
-        """Deltas from a history entry ``{"kind": …, "action": names, "state": names}``."""
-        states = dimension_names(self.features["observation.state"])
-        actions = dimension_names(self.features["action"])
-        try:
-            if described["kind"] not in KINDS:
-                raise ValueError(described["kind"])
-            return Deltas(
-                described["kind"],
-                tuple(actions.index(n) for n in described["action"]),
-                tuple(states.index(n) for n in described["state"]),
-            )
-        except (KeyError, ValueError, TypeError) as error:
-            raise DataError(f"{self.root}: meta/cqn_history.json does not fit the features: {error!r}.") from error
+    def deltas(self) -> DeltaJoints | None:
+        """Deltas of which the dataset's own history tells; None where it tells of none."""
+        now = current_description(self.history())
+        return None if now is None else parse(now, self.features, self.root)
 
     @property
     def bounds(self) -> Bounds | None:
@@ -110,7 +84,7 @@ class Source(View):
         return None
 
     def settle(self, written: Sequence[int]) -> None:
-        """Nothing depends on it here."""
+        """No-op: nothing here depends on what is written."""
 
     def history(self) -> list[dict[str, Any]]:
         """Operations that led to this dataset, as its own file tells."""
@@ -137,7 +111,7 @@ class Source(View):
                     raise DataError(f"Video file {path} of episode {episode} is missing; restore it.")
 
     def episode(self, index: int) -> Episode:
-        """Read the numbers and strings of one episode.
+        """Numbers and strings of one episode.
 
         Raises:
             DataError: the episode is empty or not where its metadata says, its timestamps do not fit the frame rate,
@@ -163,21 +137,9 @@ class Source(View):
         return episode
 
     def camera_frames(
-        self, episode: Episode, steps: NDArray[np.int64], cameras: dict[str, Camera] | None = None
+        self, episode: Episode, steps: NDArray[np.int64], cameras: Mapping[str, Camera] | None = None
     ) -> Iterator[dict[str, Any]]:
-        """Pictures of the given steps in order, each file read once from front to back.
-
-        Args:
-            episode: from :meth:`episode`, or what a view made of it.
-            steps: (K,) ascending rows of the episode.
-            cameras: what becomes of each camera's pictures; by default all, as they are.
-
-        Yields:
-            {camera: (H, W, 3) uint8}.
-
-        Raises:
-            DataError: a file or a frame cannot be read; names file, episode and frame.
-        """
+        """As :meth:`View.camera_frames`; ``episode`` may be what a view made of the one here."""
         wanted = self.cameras if cameras is None else cameras
         stills = [k for k in wanted if k in self.meta.image_keys]
         videos = {k: self._video(episode, k, steps) for k in wanted if k in self.meta.video_keys}

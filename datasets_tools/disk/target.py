@@ -1,10 +1,8 @@
-"""Write a new LeRobotDataset v3 in one piece: it is complete under its name, or there is nothing."""
+"""A new LeRobotDataset v3 while it is being written, and the history that is kept in it."""
 
 import contextlib
 import ctypes
-import errno
 import json
-import os
 import queue
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,37 +13,23 @@ from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import StreamingVideoEncoder
 
-from lerobot_cqn.errors import ConfigError, OutputError, OutputExistsError
+from lerobot_cqn.errors import OutputError
 from lerobot_cqn.schema import HISTORY, read_history
+from lerobot_cqn.story import numbered
 
-from ..terminal.console import note
+from .folders import new_folder
 
 __all__ = [
     "HISTORY",
     "Target",
     "append_history",
     "new_dataset",
-    "new_folder",
     "read_history",
-    "refuse_existing",
-    "refuse_inside",
+    "skip_entry",
     "write_history",
 ]
 
 ENCODER_THREADS = 2  # for each camera; the encoder's memory grows with them, up to gigabytes on many cores
-CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
-
-
-def refuse_existing(root: Path) -> None:
-    """Raise OutputExistsError when there is anything at ``root``."""
-    if root.exists() or root.is_symlink():
-        raise OutputExistsError(f"{root} exists already and is left as it is; choose another folder.")
-
-
-def refuse_inside(source: Path, root: Path) -> None:
-    """Raise ConfigError when ``root`` lies in the dataset folder ``source``, which must stay as it is."""
-    if source.resolve() in root.resolve().parents:
-        raise ConfigError(f"{root} lies inside the source {source}; choose a folder outside.")
 
 
 class Target:
@@ -108,37 +92,6 @@ class _Dataset(LeRobotDataset):
 
 
 @contextlib.contextmanager
-def new_folder(root: Path) -> Iterator[Path]:
-    """A temporary folder beside ``root`` that takes this name when the block ends well.
-
-    Any exception, Ctrl-C included, removes it; what a killed process left is removed by the next one for the same
-    place. Nothing is created before the block makes the folder.
-
-    Raises:
-        OutputExistsError: something is at ``root`` already, at the start or by the end.
-    """
-    refuse_existing(root)
-    folder = root.parent / f".{root.name}.{os.getpid()}.tmp"
-    try:
-        root.parent.mkdir(parents=True, exist_ok=True)
-        _sweep(root)
-        folder.mkdir()  # whether one may write there at all; whoever fills it expects to make it
-        folder.rmdir()
-    except OSError as error:
-        raise OutputError(f"Nothing can be written to {root.parent}: {error}") from error
-    try:
-        yield folder
-        refuse_existing(root)
-        os.replace(folder, root)
-    except OSError as error:
-        if error.errno not in CANNOT_WRITE:
-            raise
-        raise OutputError(f"{root} could not be written and nothing is left of it: {error}") from error
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextlib.contextmanager
 def new_dataset(
     repo_id: str,
     root: Path,
@@ -188,6 +141,12 @@ def write_history(folder: Path, operations: Sequence[Mapping[str, Any]]) -> None
     path.write_text(json.dumps({"version": 1, "operations": list(operations)}, indent=2) + "\n")
 
 
+def skip_entry(episodes: Mapping[int, str]) -> dict[str, Any]:
+    """Entry of episodes that were left out since they could not be read: number -> reason."""
+    said = f"Left out {numbered(list(episodes))}, which could not be read."  # reasons are long
+    return {"operation": "skip_bad_episodes", "episodes": dict(episodes), "told": said}
+
+
 def append_history(folder: Path, previous: Path | None, entry: Mapping[str, Any]) -> None:
     """Write the operations on ``previous`` (a dataset folder) and then ``entry``."""
     write_history(folder, [*(read_history(previous) if previous else []), dict(entry)])
@@ -197,22 +156,3 @@ def _give_back_memory() -> None:
     """Return freed memory to the system: each episode's encoder threads leave pools of it, which glibc keeps."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
-
-
-def _sweep(root: Path) -> None:
-    """Remove the temporary folders of processes that are no more."""
-    for left in root.parent.glob(f".{root.name}.*.tmp"):
-        number = left.name.removeprefix(f".{root.name}.").removesuffix(".tmp")
-        if number.isdigit() and not _alive(int(number)):
-            note(f"Removing {left}, which a killed process left behind.")
-            shutil.rmtree(left, ignore_errors=True)
-
-
-def _alive(number: int) -> bool:
-    try:
-        os.kill(number, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True

@@ -1,4 +1,4 @@
-"""What a format offers the converter: a reader of named episodes, with numbers at once and pictures one by one.
+"""Interface of a format to the converter: a reader of named episodes, with numbers at once and pictures one by one.
 
 T is the number of steps of one episode, H and W the pixels of a picture.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_cqn.errors import ConfigError, CQNError, DataError, one_of
-from lerobot_cqn.schema import ACTION, NEXT_DONE, NEXT_REWARD, NEXT_SUCCESS
+from lerobot_cqn.schema import ACTION, NEXT_DONE, NEXT_REWARD, NEXT_SUCCESS, STATE
 
 __all__ = [
     "STATE",
@@ -39,7 +39,6 @@ __all__ = [
     "whole_fps",
 ]
 
-STATE = "observation.state"
 NO_PICTURES = ("none",)
 REWARD_NAMES = {
     NEXT_REWARD: (NEXT_REWARD, "reward", "rewards"),
@@ -50,7 +49,7 @@ REWARD_NAMES = {
 
 @dataclass(frozen=True)
 class Request:
-    """What the user asked of a format; empty tuples and None leave the choice to it.
+    """Request of the user to a format; empty tuples and None leave the choice to it.
 
     Attributes:
         input: existing file or folder.

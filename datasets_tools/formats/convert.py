@@ -6,10 +6,14 @@ pictures are read one at a time while writing.
 
 import dataclasses
 import importlib
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lerobot_cqn.errors import ConfigError, DataError, one_of
+
+from ..disk.folders import local_root, refuse_existing, refuse_inside
 from ..terminal.console import load_lerobot, note, progress, result, table
 from ..terminal.options import help_page, option, parse
 
@@ -65,8 +69,6 @@ class ConvertConfig:
 
     def validate(self) -> None:
         """Check names and ranges; raises ConfigError naming the option, and what is valid."""
-        from lerobot_cqn.errors import ConfigError, one_of
-
         if self.from_ not in FORMATS:
             raise ConfigError(one_of("--from", self.from_, FORMATS))
         if self.fps is not None and self.fps < 1:
@@ -101,18 +103,16 @@ class _Skipped(list[tuple[str, str]]):
         note(f"Skipped {name}: {error}")
 
 
-def help() -> str:
+def help(summary: str) -> str:
     """Help page."""
     lines = [f"  {name:<17} {text}" for name, text in FORMATS.items()]
     formats = "\n".join(["Formats:", *lines, "More on each: docs/datasets.md."])
-    page = help_page("convert", "turn other formats into a LeRobotDataset v3", ConvertConfig, EXAMPLE, formats)
+    page = help_page("cqn-data convert", summary, ConvertConfig, EXAMPLE, formats)
     return page.replace("--from_", "--from")
 
 
 def main(args: list[str]) -> None:
     """Run from the command line; errors as in :func:`convert_dataset`."""
-    from lerobot_cqn.errors import ConfigError
-
     try:
         config = parse(ConvertConfig, [_python_name(a) for a in args])
     except ConfigError as error:
@@ -128,15 +128,11 @@ def convert_dataset(config: ConvertConfig) -> None:
         DataError: the input is missing, empty, or damaged; names the file, the episode and the frame.
         OutputExistsError: the new folder exists already.
     """
-    from lerobot_cqn.errors import DataError
-
     config.validate()
     source = Path(config.input).expanduser()
     if not source.exists():
         raise DataError(f"Nothing found at --input={config.input}; expected a file or folder.")
     load_lerobot()
-    from ..disk.source import local_root
-    from ..disk.target import refuse_existing, refuse_inside
 
     root = local_root(config.new_repo_id, config.new_root)
     if not config.dry_run:
@@ -178,14 +174,12 @@ def _convert(config: ConvertConfig, reader: "Reader", source: Path, root: Path) 
 
 
 def _plan(config: ConvertConfig, reader: "Reader", skipped: _Skipped) -> tuple[list[_Plan], dict[str, dict[str, Any]]]:
-    """Read every episode's numbers and first pictures; the first good episode tells the features.
+    """Plans of the good episodes, after a look at all numbers and first pictures; the first one tells the features.
 
     Raises:
         DataError: a damaged episode, or one of other columns than the first; with ``skip_bad_episodes`` only when
             nothing is left.
     """
-    from lerobot_cqn.errors import DataError
-
     plans: list[_Plan] = []
     features: dict[str, dict[str, Any]] = {}
     with progress() as bar:
@@ -212,8 +206,6 @@ def _features(config: ConvertConfig, episode: "Episode") -> dict[str, dict[str, 
         ConfigError: pictures too small for video.
         DataError: the first pictures cannot be read.
     """
-    from lerobot_cqn.errors import ConfigError
-
     features: dict[str, dict[str, Any]] = {
         key: {"dtype": str(values.dtype), "shape": values.shape[1:], "names": episode.names.get(key)}
         for key, values in episode.columns.items()
@@ -233,8 +225,6 @@ def _features(config: ConvertConfig, episode: "Episode") -> dict[str, dict[str, 
 
 def _compare(episode: "Episode", found: dict[str, dict[str, Any]], expected: dict[str, dict[str, Any]]) -> None:
     """Raise DataError where an episode has other columns or shapes than the first one."""
-    from lerobot_cqn.errors import DataError
-
     for key in {**expected, **found}:
         first, here = expected.get(key, {}).get("shape"), found.get(key, {}).get("shape")
         if first != here:
@@ -276,10 +266,9 @@ def _write(
     source: Path,
     root: Path,
 ) -> None:
-    from lerobot_cqn.errors import DataError
 
     from ..disk.target import append_history, new_dataset
-    from ..views.view import SOURCE_EPISODE, SOURCE_FRAME
+    from ..views.episode import SOURCE_EPISODE, SOURCE_FRAME
 
     index_feature = {"dtype": "int64", "shape": (1,), "names": None}
     declared = {**features, SOURCE_EPISODE: index_feature, SOURCE_FRAME: index_feature}
@@ -307,7 +296,7 @@ def _add(target: Any, episode: "Episode", plan: _Plan, swap_colors: bool) -> Non
     """All steps of one episode."""
     import numpy as np
 
-    from ..views.view import SOURCE_EPISODE, SOURCE_FRAME
+    from ..views.episode import SOURCE_EPISODE, SOURCE_FRAME
 
     for step, frame in enumerate(episode.frames()):
         if swap_colors:
@@ -319,11 +308,11 @@ def _add(target: Any, episode: "Episode", plan: _Plan, swap_colors: bool) -> Non
 def _history_entry(
     config: ConvertConfig, reader: "Reader", written: list[_Plan], skipped: _Skipped, source: Path
 ) -> dict[str, Any]:
-    """What was done; folders of this machine stay out of it."""
+    """Entry of the history; folders of this machine stay out of it."""
     local = (*SHARED, "task")
     settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in local}
     entry = _entry(config, source, settings | {"fps": reader.fps[0], "fps_from": reader.fps[1]})
-    return entry | {
+    entry |= {
         "total": {"episodes": len(written), "steps": sum(p.steps for p in written), **_totals(written)},
         "notes": reader.notes,
         "skipped": [{"source": name, "reason": why.replace(str(source), source.name)} for name, why in skipped],
@@ -332,6 +321,14 @@ def _history_entry(
             for i, p in enumerate(written)
         ],
     }
+    return entry | {"told": told(entry)}
+
+
+def told(entry: Mapping[str, Any]) -> str:
+    """The sentence for the history, from the entry of a conversion."""
+    total, skipped = entry["total"], entry.get("skipped")
+    said = f"Converted {entry['source']} from {entry['format']}: {total['episodes']} episodes, {total['steps']} steps"
+    return said + (f"; {len(skipped)} could not be taken over." if skipped else ".")
 
 
 def _entry(config: ConvertConfig, source: Path, settings: dict[str, Any]) -> dict[str, Any]:
@@ -358,7 +355,8 @@ def _convert_lerobot(config: ConvertConfig, source: Path, root: Path) -> None:
         return
     with converted_copy(source, root, config.new_repo_id) as folder:
         total = {"episodes": summary.episodes, "steps": summary.frames}
-        append_history(folder, source, _entry(config, source, {}) | {"total": total})
+        entry = _entry(config, source, {}) | {"total": total}
+        append_history(folder, source, entry | {"told": told(entry)})
 
 
 def _python_name(arg: str) -> str:

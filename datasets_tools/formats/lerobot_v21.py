@@ -23,7 +23,7 @@ CONVERTED = {"data", "meta", "videos", "images"}
 
 
 class Summary:
-    """What ``meta/info.json`` of a v2.1 dataset declares.
+    """Declarations of a v2.1 dataset's ``meta/info.json``.
 
     Attributes:
         episodes, frames, fps: its totals.
@@ -76,8 +76,8 @@ def converted_copy(folder: Path, target: Path, repo_id: str) -> Iterator[Path]:
         DataError: LeRobot's converter or reader refuses the data.
         OutputExistsError: something is at ``target``.
     """
+    from ..disk.folders import new_folder
     from ..disk.source import open_source
-    from ..disk.target import new_folder
 
     with new_folder(target) as new:
         copy, before = new / WORK, new / f"{WORK}_old"  # the second is where LeRobot puts what it was given

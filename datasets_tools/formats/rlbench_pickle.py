@@ -1,4 +1,4 @@
-"""Read RLBench's pickles without RLBench and without running anything that a pickle asks for.
+"""RLBench's pickles, read without RLBench and without running anything that a pickle asks for.
 
 A pickle may name any function of Python to be called. Here only the names below are known, and each leads to a
 stand-in made for this one reading, so that not even those can be changed for the rest of the process.
@@ -123,7 +123,7 @@ def _dtype() -> Callable[..., np.dtype[Any]]:
 
 
 def _latin1() -> Callable[[str, str], bytes]:
-    """How protocols up to 2 write bytes."""
+    """Bytes as protocols up to 2 write them."""
 
     def encode(text: str, encoding: str) -> bytes:
         if encoding != "latin1":
@@ -134,7 +134,7 @@ def _latin1() -> Callable[[str, str], bytes]:
 
 
 def _instances(*classes: type) -> Callable[[Any, Any, Any], Any]:
-    """How protocols 0 and 1 make an instance."""
+    """An instance as protocols 0 and 1 make it."""
 
     def make(kind: Any, base: Any, state: Any) -> Any:
         if kind not in classes or base is not object:

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_cqn.schema import NEXT_REWARD, NEXT_SUCCESS, dimension_names
+from lerobot_cqn.schema import ACTION, NEXT_REWARD, NEXT_SUCCESS, dimension_names
 from lerobot_cqn.story import code, plain, rows_of, tell
 
-from ..decisions.deltas import ACTION
+from ..disk.pictures import picture_size
 from ..disk.source import Source
-from ..operations.resize import picture_size
 from .readme import Readme, union
 
 __all__ = ["TOOL", "Facts", "Labels", "look", "write_card"]
@@ -44,7 +43,7 @@ CITATION = r"""@misc{cadene2024lerobot,
 
 @dataclass(frozen=True)
 class Facts:
-    """What a card says of a dataset.
+    """Facts about a dataset for its card.
 
     Attributes:
         robot: its type; None where the recording does not say.
@@ -79,7 +78,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Labels:
-    """What the person who pushes says: name on the Hub, licence (None: as it is, else Apache-2.0), further tags."""
+    """Choices of the person who pushes: name on the Hub, licence (None: as it is, else Apache-2.0), further tags."""
 
     repo_id: str
     license: str | None = None
@@ -89,7 +88,7 @@ class Labels:
 
 
 def look(source: Source) -> Facts:
-    """Read all numbers of a dataset, no pictures.
+    """Facts from all numbers of a dataset, no pictures.
 
     Raises:
         DataError: an episode or the history cannot be read.

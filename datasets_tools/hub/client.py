@@ -47,7 +47,7 @@ _wait = time.sleep
 
 @dataclass
 class Sent:
-    """What a push changed.
+    """Changes that a push made.
 
     Attributes:
         url: page of the repository.
@@ -69,7 +69,7 @@ class Hub:
     """One repository."""
 
     def __init__(self, repo_id: str, again: str, branch: str | None = None, kind: str = "dataset") -> None:
-        """Nothing is sent yet.
+        """A repository by its name; nothing is sent yet.
 
         Args:
             repo_id: ``user/name``.
@@ -328,7 +328,7 @@ class Hub:
         return HubError(f"The Hub refuses: {said(error)}{self._state}. When that is mended, {push}")
 
     def _refused(self, status: int, text: str) -> str:
-        """What an answer means and what to do before pushing again."""
+        """Meaning of an answer, and what to do before pushing again."""
         name = self.repo_id
         if status == 403:
             who = self._who()

@@ -1,7 +1,9 @@
-"""Where on the Hub something goes, and how: the options that pushing a dataset and pushing a policy share."""
+"""Place and manner of a push: the options that pushing a dataset and pushing a policy share."""
 
 import dataclasses
 import re
+
+from lerobot_cqn.errors import ConfigError
 
 from ..terminal.options import option
 
@@ -29,8 +31,6 @@ class HubTarget:
 
     def validate(self) -> None:
         """Check forms; raises ConfigError naming the option, what was expected and what was found."""
-        from lerobot_cqn.errors import ConfigError
-
         check_repo_id(self.repo_id, "--repo_id")
         if self.license is not None and not LICENSE.fullmatch(self.license):
             raise ConfigError(f"Expected --license as on the Hub, e.g. apache-2.0 or cc-by-4.0, got '{self.license}'.")
@@ -44,9 +44,7 @@ class HubTarget:
 
 
 def check_repo_id(repo_id: str, option_name: str) -> None:
-    """Raises ConfigError where the Hub would not take a name; option_name: who gave it, for the message."""
-    from lerobot_cqn.errors import ConfigError
-
+    """Check of a name; raises ConfigError where the Hub would not take it. option_name: of who gave it."""
     parts = repo_id.split("/")
     if len(parts) != 2 or not all(NAME.fullmatch(p) and "--" not in p and ".." not in p for p in parts):
         raise ConfigError(

@@ -5,6 +5,8 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lerobot_cqn.errors import DataError
+
 from ..terminal.console import load_lerobot, note, result
 from ..terminal.options import help_page, option, parse
 from .options import HubTarget
@@ -15,7 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = ["PushConfig", "help", "main"]
 
-SUMMARY = "upload a dataset to the Hugging Face Hub, with a card that tells how it came about"
 EXAMPLE = """
 cqn-data push --repo_id=user/pick --root=data/pick_cqn --dry_run
 cqn-data push --repo_id=user/pick --root=data/pick_cqn --private --tags='[ur5e, click]'
@@ -36,9 +37,9 @@ class PushConfig(HubTarget):
     root: str | None = option(None, help="Folder of the dataset; by default LeRobot's home and the repo_id.")
 
 
-def help() -> str:
+def help(summary: str) -> str:
     """Help page."""
-    return help_page("push", SUMMARY, PushConfig, EXAMPLE, NOTES)
+    return help_page("cqn-data push", summary, PushConfig, EXAMPLE, NOTES)
 
 
 def main(args: list[str]) -> None:
@@ -100,7 +101,6 @@ def _files(root: Path) -> "dict[str, Path]":
 
 
 def _own_card(root: Path) -> str | None:
-    from lerobot_cqn.errors import DataError
 
     path = root / README
     if not path.is_file():
@@ -113,8 +113,6 @@ def _own_card(root: Path) -> str | None:
 
 def _merged_card(hub: "Hub", facts: "Facts", labels: "Labels", own: str | None) -> str:
     """The card from what lies in the folder or else on the Hub; says what it does to a card of a person."""
-    from lerobot_cqn.errors import DataError
-
     from .card import TOOL, write_card
     from .readme import Readme, start_mark
 

@@ -36,7 +36,7 @@ class Readme:
 
     @property
     def own_text(self) -> str:
-        """What a person wrote."""
+        """Text that a person wrote."""
         return f"{self.before.strip()}\n{self.after.strip()}".strip()
 
     def with_part(self, front: Mapping[str, Any], part: str, title: str) -> str:

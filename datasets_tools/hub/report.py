@@ -1,4 +1,4 @@
-"""What a person sees of a push: what would be sent, and what was."""
+"""A push as a person sees it: files that would be sent, and those that were."""
 
 from collections.abc import Mapping
 
@@ -25,7 +25,7 @@ def show_dry(files: Mapping[str, Content], card: str, repo_id: str) -> None:
 
 
 def show_sent(sent: Sent, repo_id: str, what: str) -> None:
-    """What a push changed; what: "dataset" or "policy"."""
+    """Print the changes of a push; what: "dataset" or "policy"."""
     if sent.removed:
         some = ", ".join(sent.removed[:3]) + (", …" if len(sent.removed) > 3 else "")
         note(f"Removed {len(sent.removed)} files that the {what} no longer has: {some}; the history keeps them.")

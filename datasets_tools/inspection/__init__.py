@@ -1,1 +1,1 @@
-"""What `inspect` measures, judges and draws."""
+"""Measures, judgements and drawings of `inspect`."""

@@ -1,4 +1,4 @@
-"""What ``cqn-data inspect`` sees of the cameras: a few pictures of each, spread over the recording."""
+"""Cameras as ``cqn-data inspect`` sees them: a few pictures of each, spread over the recording."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..disk.source import Source
-from ..views.view import Camera
+from ..views.episode import Camera
 
 if TYPE_CHECKING:
     from .numbers import EpisodeNumbers

@@ -1,4 +1,4 @@
-"""What the numbers of ``cqn-data inspect`` mean: findings with a level, a place and an advice."""
+"""Judgements of ``cqn-data inspect`` on its numbers: findings with a level, a place and an advice."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -6,10 +6,10 @@ from typing import Literal
 
 import numpy as np
 
-from lerobot_cqn.schema import ACTION, NEXT_REWARD
+from lerobot_cqn.schema import ACTION, NEXT_REWARD, STATE
 
 from .cameras import CameraLook
-from .numbers import STATE, Dimension, Numbers
+from .numbers import Dimension, Numbers
 
 __all__ = ["LEVELS", "Dataset", "Finding", "Level", "Memory", "findings", "memory"]
 
@@ -47,7 +47,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Dataset:
-    """What the metadata say: frames a second, columns, whether its history calls the actions differences."""
+    """Metadata: frames a second, columns, whether its history calls the actions differences."""
 
     repo_id: str
     fps: int
@@ -66,7 +66,7 @@ class Memory:
 
 
 def memory(numbers: Numbers, cameras: Sequence[CameraLook]) -> Memory:
-    """What the replay will need; an episode of T steps has T + 1 observations there."""
+    """Memory that the replay will need, in bytes; an episode of T steps has T + 1 observations there."""
     observed = numbers.steps + len(numbers.episodes)
     state, action = len(numbers.of(STATE)), len(numbers.of(ACTION))
     return Memory(

@@ -1,4 +1,4 @@
-"""How actions and states belong together: absolute targets or differences, and how far the arm lags behind.
+"""Relation of actions and states: absolute targets or differences, and how far the arm lags behind.
 
 Shapes: T time steps of one episode, J joints that have an action and a state, L lags. In a dataset, action a[t] leads
 to state s[t+1]; a lag of 1 step is the shortest an arm can have.
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.errors import DataError
 
+from ..decisions.joints import match_joints
 from ..disk.source import Source
-from ..views.readable import match_joints
 
 __all__ = ["Correlation", "Follow", "FollowKind"]
 
@@ -75,7 +75,7 @@ class Follow:
     def of(cls, source: Source) -> Self | None:
         """For a dataset whose actions can be matched with its states by name or number; else None."""
         try:
-            action_dims, state_dims = match_joints(source)
+            action_dims, state_dims = match_joints(source.features)
         except DataError:
             return None
         return cls(action_dims, state_dims, source.fps) if action_dims else None
@@ -103,7 +103,7 @@ class Follow:
         return self._gap / max(1, self._count)
 
     def kind(self) -> FollowKind:
-        """What the actions look like: positions, differences, or something else (end-effector poses, rates)."""
+        """Likely kind of the actions: positions, differences, or something else (end-effector poses, rates)."""
         level = _middle(self._level.value())
         answer = max(_middle(c.value()) for c in self._values)
         if level >= TRACKS or (level >= 0.5 and level > answer):

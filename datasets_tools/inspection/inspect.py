@@ -10,6 +10,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lerobot_cqn.errors import DataError, OutputExistsError
+from lerobot_cqn.schema import STATE
+
+from ..disk.folders import refuse_existing
 from ..terminal.console import load_lerobot, note, progress, result, table
 from ..terminal.options import help_page, option, parse
 
@@ -50,7 +54,7 @@ class InspectConfig:
 
     @property
     def page(self) -> Path | None:
-        """Where the page goes."""
+        """File of the page; None where none is written."""
         if self.html:
             return Path(self.html).expanduser()
         numbered = (Path(PAGE if n == 1 else f"{Path(PAGE).stem}_{n}.html") for n in itertools.count(1))
@@ -72,9 +76,9 @@ class Inspection:
         return not any(f.level == "error" for f in self.findings)
 
 
-def help() -> str:
+def help(summary: str) -> str:
     """Help page."""
-    return help_page("inspect", "look at a dataset before training", InspectConfig, EXAMPLE, NOTES)
+    return help_page("cqn-data inspect", summary, InspectConfig, EXAMPLE, NOTES)
 
 
 def main(args: list[str]) -> int:
@@ -85,12 +89,9 @@ def main(args: list[str]) -> int:
         DataError: the dataset cannot be opened; with ``--strict`` the exit code is 1 instead.
         OutputExistsError: the page's file exists already.
     """
-    from lerobot_cqn.errors import DataError
-
     config = parse(InspectConfig, args)
     load_lerobot()
     from ..disk.source import open_source
-    from ..disk.target import refuse_existing
     from .checks import Finding
 
     page = config.page  # once: after it is written, the next free name is another one
@@ -124,7 +125,7 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
 
     from .cameras import look, missing_videos
     from .checks import Dataset, findings
-    from .numbers import STATE, measure
+    from .numbers import measure
 
     missing = missing_videos(source)
     with progress() as bar:
@@ -150,7 +151,6 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
 
 
 def _write_page(path: Path, inspection: Inspection) -> None:
-    from lerobot_cqn.errors import OutputExistsError
 
     from .page import page
 

@@ -1,4 +1,4 @@
-"""What ``cqn-data inspect`` measures in states, actions and rewards. Episodes stream by; only sums are kept.
+"""Measures of ``cqn-data inspect`` on states, actions and rewards. Episodes stream by; only sums are kept.
 
 Shapes: T time steps of one episode, E episodes, S state dimensions, A action dimensions, J joints that have both.
 """
@@ -12,17 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_cqn.errors import DataError
-from lerobot_cqn.schema import ACTION, NEXT_REWARD, NEXT_SUCCESS, dimension_names
+from lerobot_cqn.schema import ACTION, NEXT_REWARD, NEXT_SUCCESS, STATE, dimension_names
 
+from ..decisions.joints import gripper_dims
 from ..decisions.pause_threshold import Motion, Suggestion
 from ..decisions.pauses import pause_runs
 from ..disk.source import Source
-from ..views.view import Episode, gripper_dims
+from ..views.episode import Episode
 from .follow import Follow
 
 __all__ = ["DRAWN", "Dimension", "EpisodeNumbers", "Jump", "Numbers", "measure"]
 
-STATE = "observation.state"
 FAR, LARGE = 8.0, 0.1  # a jump is so many times the change that one in twenty exceeds, and so much of the range
 MAX_JUMPS = 20
 DRAWN = 40  # episodes whose pauses are drawn

@@ -5,9 +5,11 @@ import html
 import io
 from collections.abc import Callable, Iterable, Sequence
 
+from lerobot_cqn.schema import STATE
+
 from .cameras import CameraLook
 from .checks import LEVELS, PAPER_SIZE, Dataset, Finding, memory
-from .numbers import STATE, Dimension, EpisodeNumbers, Numbers
+from .numbers import Dimension, EpisodeNumbers, Numbers
 from .svg import pauses, spark, still_share, threshold_histogram
 
 __all__ = ["page", "sentence_of_actions", "size_text", "verdict"]
@@ -97,7 +99,7 @@ def overview(dataset: Dataset, numbers: Numbers, cameras: Sequence[CameraLook]) 
 
 
 def verdict(found: Sequence[Finding]) -> str:
-    """How many findings there are of each level."""
+    """Number of findings of each level, as a sentence."""
     counts = {level: sum(f.level == level for f in found) for level in LEVELS}
     listed = ", ".join(f"{n} {level}{'s' if n != 1 else ''}" for level, n in counts.items() if n)
     start = "Not ready for training" if counts["error"] else "Ready for training"
@@ -105,7 +107,7 @@ def verdict(found: Sequence[Finding]) -> str:
 
 
 def sentence_of_actions(numbers: Numbers) -> str:
-    """What the actions look like and how far the arm is behind; empty where they cannot be matched with states."""
+    """Kind of the actions and lag of the arm in a sentence; empty where they cannot be matched with states."""
     follow = numbers.follow
     if follow is None or not numbers.episodes:
         return ""

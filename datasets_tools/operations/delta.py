@@ -1,17 +1,22 @@
 """``cqn-data delta``: absolute joint actions to delta joint actions on disk, and back. The maths: see ``deltas``."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
+
+from lerobot_cqn.delta_actions import KINDS, DeltaJoints, Kind, description
+from lerobot_cqn.errors import ConfigError, DataError, one_of
+from lerobot_cqn.schema import ACTION, STATE, dimension_names
 
 from ..terminal.console import note, result, table
 from ..terminal.options import option
-from .job import Step, help_for, main_for, settings_of
+from .job import Step, settings_of
 
 if TYPE_CHECKING:
-    from ..decisions.deltas import Deltas
-    from ..views.view import Episode, View
+    from ..views.episode import Episode
+    from ..views.view import DerivedView, View
 
-__all__ = ["Delta", "help", "main"]
+__all__ = ["Delta"]
 
 
 @dataclasses.dataclass
@@ -19,7 +24,6 @@ class Delta(Step):
     """Settings of ``cqn-data delta``."""
 
     name = "delta"
-    summary = "turn absolute joint actions into delta joint actions, or back"
     example = """
 cqn-data delta --repo_id=local/pick --root=data/pick --new_root=data/pick_delta
 cqn-data delta --repo_id=local/pick_delta --root=data/pick_delta --new_root=data/pick_back --to=absolute
@@ -43,10 +47,6 @@ of the next step minus this one (the way back gives where the arm went, not what
 
     def validate(self) -> None:
         """Check choices; raises ConfigError naming the option and the valid values."""
-        from lerobot_cqn.errors import ConfigError, one_of
-
-        from ..decisions.deltas import KINDS
-
         for name, valid in (("to", ("delta", "absolute")), ("of", ("auto", *KINDS))):
             if getattr(self, name) not in valid:
                 raise ConfigError(one_of(f"--{name}", getattr(self, name), valid))
@@ -55,11 +55,11 @@ of the next step minus this one (the way back gives where the arm went, not what
                 "--to=absolute takes its kind from the dataset's history; leave out --of and --keep_absolute."
             )
 
-    def on(self, view: "View") -> "View":
+    def on(self, view: "View") -> "DerivedView":
         """Decide which dimensions are joints; raises ConfigError or DataError where that cannot be done."""
-        from ..views.delta import AbsoluteView, DeltaView, described
+        from ..views.delta import AbsoluteView, DeltaView
 
-        after: View
+        after: DerivedView
         if self.to == "absolute":
             deltas = self._known(view)
             after = AbsoluteView(view)
@@ -68,15 +68,22 @@ of the next step minus this one (the way back gives where the arm went, not what
         else:
             deltas = self._wanted(view)
             after = DeltaView(view, made=deltas)
-        names = described(view, deltas)
+        names = description(deltas, view.features)
         result(f"{self.to.capitalize()} actions of kind {deltas.kind}: {', '.join(names['action'])}")
         _show(after)
         now = names if self.to == "delta" else None
         after.entry.update(settings=settings_of(self) | {"of": deltas.kind}, deltas=now)
         return after
 
-    def _known(self, view: "View") -> "Deltas":
-        from lerobot_cqn.errors import ConfigError
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """The sentence for the history."""
+        kind = entry["settings"]["of"]
+        if not entry["deltas"]:
+            return f"Turned the delta actions of kind {kind} back into absolute ones."
+        return f"Turned absolute actions into deltas of kind {kind}, of {', '.join(entry['deltas']['action'])}."
+
+    def _known(self, view: "View") -> "DeltaJoints":
 
         if view.deltas is None:
             raise ConfigError(
@@ -85,15 +92,10 @@ of the next step minus this one (the way back gives where the arm went, not what
             )
         return view.deltas
 
-    def _wanted(self, view: "View") -> "Deltas":
+    def _wanted(self, view: "View") -> "DeltaJoints":
         import numpy as np
 
-        from lerobot_cqn.errors import ConfigError, DataError, one_of
-        from lerobot_cqn.schema import dimension_names
-
-        from ..decisions.deltas import ACTION, STATE, Deltas, Kind
-        from ..views.readable import match_joints
-        from ..views.view import gripper_dims
+        from ..decisions.joints import gripper_dims, match_joints
 
         if view.deltas is not None:
             raise ConfigError(f"The actions are deltas already (kind {view.deltas.kind}); nothing to do.")
@@ -108,8 +110,8 @@ of the next step minus this one (the way back gives where the arm went, not what
                 raise DataError(f"There is no '{ACTION}' to take commands from; leave out --of={self.of}.")
             left_out = gripper_dims(names, self.keep_absolute)
             joints = tuple(i for i in range(len(names)) if i not in left_out)
-            return Deltas("state", joints, joints)
-        matched = match_joints(view, self.keep_absolute)
+            return DeltaJoints("state", joints, joints)
+        matched = match_joints(view.features, self.keep_absolute)
         kind = cast(Kind, "command" if self.of == "auto" else self.of)
         if not matched[0]:
             raise DataError(f"No action dimension would be a delta: {', '.join(names)} are all kept absolute.")
@@ -121,16 +123,12 @@ of the next step minus this one (the way back gives where the arm went, not what
             gap.append(np.abs(columns[ACTION][:, list(matched[0])] - state).mean(axis=0))
         if (np.mean(gap, axis=0) > np.maximum(high - low, 1e-9)).mean() > 0.5:
             note("Most commands are farther from the arm than it ever moves: these actions look like deltas already.")
-        return Deltas(kind, *matched)
+        return DeltaJoints(kind, *matched)
 
 
 def _show(view: "View") -> None:
     """Range of every dimension after the operation."""
     import numpy as np
-
-    from lerobot_cqn.schema import dimension_names
-
-    from ..decisions.deltas import ACTION
 
     def actions(episode: "Episode") -> Any:
         return np.asarray(episode.columns[ACTION], np.float64)
@@ -143,13 +141,3 @@ def _show(view: "View") -> None:
         size, steps = size + np.abs(values).sum(axis=0), steps + len(values)
     rows = [[n, f"{a:.4g}", f"{b:.4g}", f"{c:.4g}"] for n, a, b, c in zip(names, low, high, size / steps, strict=True)]
     table(["dimension", "min", "max", "mean size"], rows)
-
-
-def help() -> str:
-    """Help page."""
-    return help_for(Delta)
-
-
-def main(args: list[str]) -> None:
-    """Run from the command line; errors as in ``run_job``."""
-    main_for(Delta, args)

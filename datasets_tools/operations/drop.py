@@ -1,16 +1,20 @@
 """``cqn-data drop``: leave out whole episodes, by number or by rule; the reason is kept in the history."""
 
 import dataclasses
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from lerobot_cqn.errors import ConfigError, DataError
+from lerobot_cqn.story import numbered
 
 from ..terminal.console import result, table
 from ..terminal.options import option
-from .job import Step, help_for, main_for, settings_of
+from .job import Step, settings_of
 
 if TYPE_CHECKING:
-    from ..views.view import View
+    from ..views.view import DerivedView, View
 
-__all__ = ["Drop", "help", "main"]
+__all__ = ["Drop"]
 
 
 @dataclasses.dataclass
@@ -18,7 +22,6 @@ class Drop(Step):
     """Settings of ``cqn-data drop``."""
 
     name = "drop"
-    summary = "leave out whole episodes, by number or by rule"
     example = """
 cqn-data drop --repo_id=local/click --root=data/click --new_root=data/click_good \\
     --episodes='[3, 7]' --where='steps < 20' --reason='hand in the picture'
@@ -36,16 +39,12 @@ observation.state[gripper.pos], followed by .first, .last, .min, .max, .mean or 
 
     def validate(self) -> None:
         """Something must be asked for."""
-        from lerobot_cqn.errors import ConfigError
-
         if not self.episodes and not self.where:
             raise ConfigError("Nothing to drop: expected --episodes='[…]' or --where='RULE'.")
 
-    def on(self, view: "View") -> "View":
+    def on(self, view: "View") -> "DerivedView":
         """Find the episodes; raises ConfigError for a number that is not there."""
         import numpy as np
-
-        from lerobot_cqn.errors import ConfigError, DataError
 
         from ..decisions.episode_rules import parse_rule
         from ..views.selected import Selected
@@ -55,15 +54,16 @@ observation.state[gripper.pos], followed by .first, .last, .min, .max, .mean or 
             raise ConfigError(
                 f"No episode {unknown[0]}: expected numbers from {min(view.episodes)} to {max(view.episodes)}."
             )
-        rule = parse_rule(self.where, view) if self.where else None
+        rule = parse_rule(self.where, view.features) if self.where else None
         dropped: dict[int, str] = {}
         after = Selected(view)
         for index in view.episodes:
             episode = view.episode(index)
             if index in self.episodes:
                 dropped[index] = self.reason or "named"
-            elif rule and rule.holds(episode, view.fps):
-                measured = f"{rule.text} ({rule.quantity(episode, view.fps):.4g})"
+            elif rule and rule.holds(episode.columns, len(episode), view.fps):
+                quantity = rule.quantity(episode.columns, len(episode), view.fps)
+                measured = f"{rule.text} ({quantity:.4g})"
                 dropped[index] = f"{self.reason}: {measured}" if self.reason else measured
             else:
                 after.rows[index] = np.arange(len(episode))
@@ -77,12 +77,12 @@ observation.state[gripper.pos], followed by .first, .last, .min, .max, .mean or 
         after.entry.update(settings=settings_of(self), dropped={str(k): v for k, v in dropped.items()})
         return after
 
-
-def help() -> str:
-    """Help page."""
-    return help_for(Drop)
-
-
-def main(args: list[str]) -> None:
-    """Run from the command line; errors as in ``run_job``."""
-    main_for(Drop, args)
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """The sentence for the history."""
+        dropped = entry["dropped"]
+        if not dropped:
+            return "Dropped no episode."
+        groups = {why: [i for i in dropped if dropped[i] == why] for why in dropped.values()}
+        reasons = "; ".join(f"{why}: {numbered(episodes)}" for why, episodes in groups.items())
+        return f"Dropped {len(dropped)} episode{'s' * (len(dropped) != 1)} ({reasons})."

@@ -1,17 +1,24 @@
 """``cqn-data filter``: leave out the time steps in which nothing moves. The rule and why it is safe: see ``pauses``."""
 
 import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lerobot_cqn.errors import ConfigError, DataError, one_of
+from lerobot_cqn.schema import ACTION, STATE, dimension_names
+from lerobot_cqn.story import numbered, shown
+
+from ..disk.folders import refuse_existing
 from ..terminal.console import note, result, table
 from ..terminal.options import option
-from .job import Job, Step, help_for, main_for, run_job, settings_of
+from .job import Step, settings_of
 
 if TYPE_CHECKING:
     from ..decisions.pauses import EpisodeReport, Rule
-    from ..views.view import View
+    from ..views.view import DerivedView, View
 
-__all__ = ["Filter", "filter_dataset", "help", "main"]
+__all__ = ["Filter"]
 
 
 @dataclasses.dataclass
@@ -19,7 +26,6 @@ class Filter(Step):
     """Settings of ``cqn-data filter``; units are those of the dataset (often radians, or degrees)."""
 
     name = "filter"
-    summary = "leave out the time steps in which nothing moves"
     example = """
 cqn-data filter --repo_id=local/click --root=data/click --auto --dry_run
 cqn-data filter --repo_id=local/click --root=data/click \\
@@ -65,12 +71,6 @@ Delta actions are formed anew, so that they connect the states that are left.
 
     def validate(self) -> None:
         """Check ranges; raises ConfigError naming the option, the range and the value."""
-        from pathlib import Path
-
-        from lerobot_cqn.errors import ConfigError, one_of
-
-        from ..disk.target import refuse_existing
-
         thresholds = [("threshold", 1.0 if self.threshold is None else self.threshold), *self.joint_thresholds.items()]
         for name, value in thresholds:
             if not 0 < value < float("inf"):
@@ -89,7 +89,7 @@ Delta actions are formed anew, so that they connect the states that are left.
                 raise ConfigError(f"Expected --preview=FILE.mp4 or FILE.png, got '{self.preview}'.")
             refuse_existing(Path(self.preview))
 
-    def on(self, view: "View") -> "View":
+    def on(self, view: "View") -> "DerivedView":
         """Decide which steps stay; reads numbers only, no pictures but for the preview."""
         from ..views.selected import filtered_view
 
@@ -112,14 +112,23 @@ Delta actions are formed anew, so that they connect the states that are left.
         )
         return after
 
-    def rule(self, view: "View") -> "tuple[Rule, dict[str, Any]]":
-        """What a pause is in this dataset, and how an automatic threshold was decided."""
-        from lerobot_cqn.errors import ConfigError, DataError, one_of
-        from lerobot_cqn.schema import dimension_names
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """The sentence for the history."""
+        total = entry["total"]
+        gone, pauses = total["steps"] - total["kept"], sum(len(e["pauses"]) for e in entry["episodes"])
+        settings, left = entry["settings"], entry.get("left_out")
+        why = f" {settings['why'].rstrip('.')}." if settings.get("why") else ""
+        short = f" Left out {numbered(list(left))}, of which too little would be left." if left else ""
+        return (
+            f"Left out {gone} of {total['steps']} steps ({gone / total['steps']:.0%}), in {pauses} pauses in which"
+            f" nothing moves: below {shown(settings['threshold'])} a step.{why}{short}"
+        )
 
-        from ..decisions.deltas import ACTION, STATE
+    def rule(self, view: "View") -> "tuple[Rule, dict[str, Any]]":
+        """Rule of what a pause is in this dataset, and reasons for an automatic threshold."""
+        from ..decisions.joints import gripper_dims
         from ..decisions.pauses import Rule
-        from ..views.view import gripper_dims
 
         for key in (STATE, ACTION):
             if key not in view.features:
@@ -169,7 +178,6 @@ Delta actions are formed anew, so that they connect the states that are left.
 
 def _choose(view: "View", joints: tuple[int, ...]) -> tuple[float, dict[str, Any]]:
     """A threshold from the data, and why; the earlier one where the pauses it would be read from are gone."""
-    from ..decisions.deltas import STATE
     from ..decisions.pause_threshold import suggest
 
     for entry in reversed(view.history()):
@@ -182,21 +190,6 @@ def _choose(view: "View", joints: tuple[int, ...]) -> tuple[float, dict[str, Any
     if not found.clear:
         note("Look at the histogram (cqn-data inspect) and give --threshold where you know better.")
     return found.threshold, {"why": found.reason, "clear": found.clear}
-
-
-def help() -> str:
-    """Help page."""
-    return help_for(Filter)
-
-
-def main(args: list[str]) -> None:
-    """Run from the command line; errors as in ``run_job``."""
-    main_for(Filter, args)
-
-
-def filter_dataset(job: Job, settings: Filter) -> list[dict[str, Any]]:
-    """Filter a dataset from Python; returns and raises as ``run_job``."""
-    return run_job(job, [settings])
 
 
 def _show(reports: "list[EpisodeReport]") -> None:

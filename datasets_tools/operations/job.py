@@ -5,22 +5,26 @@ The only place where operations, source and target meet; ``cqn-data OPERATION`` 
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from lerobot_cqn.delta_actions import KINDS
+from lerobot_cqn.errors import ConfigError, one_of
+
+from ..disk.folders import local_root, refuse_existing, refuse_inside
 from ..terminal.console import load_lerobot, note, progress, result
 from ..terminal.options import help_page, option, parse_all
 
 if TYPE_CHECKING:
-    from ..views.view import View
+    from ..views.view import DerivedView, View
 
 __all__ = ["Job", "Step", "help_for", "main_for", "run_job", "settings_of"]
 
 
 @dataclasses.dataclass
 class Job:
-    """Where to read and write; the same for every operation, named as in ``lerobot-edit-dataset``."""
+    """Places to read and write; the same for every operation, named as in ``lerobot-edit-dataset``."""
 
     repo_id: str = option(help="Dataset to read, as user/name.")
     root: str | None = option(None, help="Its folder; by default LeRobot's home and the repo_id.")
@@ -45,10 +49,6 @@ class Job:
 
     def validate(self) -> None:
         """Check choices; raises ConfigError naming the option and the valid values."""
-        from lerobot_cqn.errors import ConfigError, one_of
-
-        from ..decisions.deltas import KINDS
-
         if self.crf is not None and not 0 <= self.crf <= 63:
             raise ConfigError(f"Expected --crf in [0, 63], got {self.crf}.")
         if self.actions not in (valid := ("auto", "absolute", *KINDS)):
@@ -59,14 +59,13 @@ class Step:
     """An operation with its settings: a dataclass whose fields are options."""
 
     name: ClassVar[str]
-    summary: ClassVar[str]
     example: ClassVar[str]
     notes: ClassVar[str] = ""
 
     def validate(self) -> None:
         """Check ranges; raises ConfigError naming the option, what was expected and what was found."""
 
-    def on(self, view: "View") -> "View":
+    def on(self, view: "View") -> "DerivedView":
         """Look at all episodes, print what will be done, and return the view after this operation.
 
         Raises:
@@ -75,6 +74,11 @@ class Step:
         """
         raise NotImplementedError
 
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """A sentence for people that says what was done, from the operation's own entry of the history; "" for none."""
+        return ""
+
 
 def main_for(step_class: type[Step], args: Sequence[str]) -> None:
     """Run one operation from its command line; errors as in :func:`run_job`."""
@@ -82,10 +86,10 @@ def main_for(step_class: type[Step], args: Sequence[str]) -> None:
     run_job(job, [step])
 
 
-def help_for(step_class: type[Step]) -> str:
-    """Help page of an operation."""
+def help_for(step_class: type[Step], summary: str) -> str:
+    """Help page of an operation that its summary describes in one line."""
     s = step_class
-    return help_page(s.name, s.summary, (s, Job), s.example, s.notes)
+    return help_page(f"cqn-data {s.name}", summary, (s, Job), s.example, s.notes)
 
 
 def settings_of(step: Step) -> dict[str, Any]:
@@ -115,9 +119,8 @@ def run_job(job: Job, steps: Sequence[Step], name: str | None = None) -> list[di
         step.validate()
     load_lerobot()
     from ..disk.encode import write
-    from ..disk.source import local_root, open_source
-    from ..disk.target import refuse_existing, refuse_inside
-    from ..views.readable import readable
+    from ..disk.readable import readable
+    from ..disk.source import open_source
 
     new_repo_id = job.new_repo_id or f"{job.repo_id}_{name or steps[0].name}"
     new_root = local_root(new_repo_id, job.new_root)
@@ -128,13 +131,15 @@ def run_job(job: Job, steps: Sequence[Step], name: str | None = None) -> list[di
         refuse_existing(Path(job.report))
     source = open_source(job.repo_id, job.root)
     before = len(source.history())
-    view: View = readable(source, job)
+    view = readable(source, job.actions, skip_bad_episodes=job.skip_bad_episodes, needs_videos=not job.dry_run)
     for step in steps:
         if len(steps) > 1:
             result(f"[{step.name}]")
         view = step.on(view)
         view.entry.update({"operation": step.name, "source": job.repo_id, "target": new_repo_id})
-    _check_bounds(steps, view)
+        if sentence := step.told(view.entry):
+            view.entry["told"] = sentence
+    _check_bounds(steps, view, source.bounds is not None)
     entries = view.history()[before:]
     if job.report:
         Path(job.report).write_text(json.dumps(entries, indent=2) + "\n")
@@ -142,7 +147,7 @@ def run_job(job: Job, steps: Sequence[Step], name: str | None = None) -> list[di
         result("Dry run: nothing was written.")
         return entries
     with progress() as bar:
-        written = write(view, new_repo_id, new_root, bar, skip=job.skip_bad_episodes, crf=job.crf)
+        written = write(view, source, new_repo_id, new_root, bar, skip=job.skip_bad_episodes, crf=job.crf)
     for episode, reason in written.skipped.items():
         note(f"Left out episode {episode}: {reason}")
     how = "videos copied as they were" if written.copied else "videos encoded anew" if source.meta.video_keys else ""
@@ -153,12 +158,11 @@ def run_job(job: Job, steps: Sequence[Step], name: str | None = None) -> list[di
     return view.history()[before:]
 
 
-def _check_bounds(steps: Sequence[Step], view: "View") -> None:
-    from lerobot_cqn.errors import ConfigError
+def _check_bounds(steps: Sequence[Step], view: "View", had_bounds: bool) -> None:
 
     names = [step.name for step in steps]
     if "bounds" in names and view.bounds is None:
         after = ", ".join(names[names.index("bounds") + 1 :])
         raise ConfigError(f"bounds must come after the steps that change actions; here these follow it: {after}.")
-    if view.source.bounds is not None and view.bounds is None:
+    if had_bounds and view.bounds is None:
         note("The source's action bounds do not hold for the result; set them again with bounds.")

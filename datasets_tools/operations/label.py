@@ -1,18 +1,23 @@
 """``cqn-data label``: sparse rewards, done and success from a list, a column, a rule, or for all episodes."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
+
+from lerobot_cqn.errors import ConfigError, one_of
+from lerobot_cqn.story import numbered
 
 from ..terminal.console import note, table
 from ..terminal.options import option
-from ..views.view import Episode, View
-from .job import Step, help_for, main_for, settings_of
+from .job import Step, settings_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
-__all__ = ["Label", "help", "main"]
+    from ..views.episode import Episode
+    from ..views.view import DerivedView, View
+
+__all__ = ["Label"]
 
 
 @dataclasses.dataclass
@@ -20,7 +25,6 @@ class Label(Step):
     """Settings of ``cqn-data label``."""
 
     name = "label"
-    summary = "write sparse rewards: 1 on the last step of successful episodes"
     example = """
 cqn-data label --repo_id=local/pick --root=data/pick --new_root=data/pick_labelled --all
 cqn-data label --repo_id=local/pick --root=data/pick --new_root=data/pick_labelled --failed='[4, 11]'
@@ -44,16 +48,15 @@ Videos are copied as they are. Rules: QUANTITY OPERATOR NUMBER, see drop --help.
 
     def validate(self) -> None:
         """Exactly one way must be given."""
-        from lerobot_cqn.errors import ConfigError
-
         given = [n for n in ("all", "episodes", "failed", "column", "rule") if getattr(self, n)]
         if len(given) != 1:
             found = ", ".join(f"--{n}" for n in given) or "none"
             raise ConfigError(f"Expected one of --all, --episodes, --failed, --column, --rule; got {found}.")
 
-    def on(self, view: View) -> View:
+    def on(self, view: "View") -> "DerivedView":
         """Judge every episode; raises ConfigError for an unknown episode, column or rule."""
         from ..decisions.rewards import REWARD_FEATURES
+        from ..views.labelled import Labelled
 
         judge = self._judge(view)
         successes = {i: judge(view.episode(i)) for i in view.episodes}
@@ -70,16 +73,21 @@ Videos are copied as they are. Rules: QUANTITY OPERATOR NUMBER, see drop --help.
         after.entry.update(settings=settings_of(self), failures=[i for i, ok in successes.items() if not ok])
         return after
 
-    def _judge(self, view: View) -> Callable[[Episode], bool]:
-        import numpy as np
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """The sentence for the history."""
+        failed = entry["failures"]
+        which = f"every episode but {numbered(failed)}, which failed" if failed else "every episode; all are successes"
+        return f"Wrote sparse rewards: 1 on the last step of {which}."
 
-        from lerobot_cqn.errors import ConfigError, one_of
+    def _judge(self, view: "View") -> "Callable[[Episode], bool]":
+        import numpy as np
 
         from ..decisions.episode_rules import parse_rule
 
         if self.rule:
-            rule = parse_rule(self.rule, view)
-            return lambda episode: rule.holds(episode, view.fps)
+            rule = parse_rule(self.rule, view.features)
+            return lambda episode: rule.holds(episode.columns, len(episode), view.fps)
         if self.column is not None:
             column = self.column
             numbers = [k for k, f in view.features.items() if f["dtype"] not in ("string", "image", "video")]
@@ -96,36 +104,5 @@ Videos are copied as they are. Rules: QUANTITY OPERATOR NUMBER, see drop --help.
         return lambda episode: self.all or episode.index in self.episodes
 
 
-@dataclasses.dataclass
-class Labelled(View):
-    """With sparse rewards."""
-
-    successes: dict[int, bool] = dataclasses.field(default_factory=dict)
-
-    @property
-    def features(self) -> dict[str, dict[str, Any]]:
-        """With the reward columns."""
-        from ..decisions.rewards import REWARD_FEATURES
-
-        return {**self.parent.features, **REWARD_FEATURES}
-
-    def episode(self, index: int) -> Episode:
-        """The steps with rewards."""
-        from ..decisions.rewards import last_step_rewards
-
-        episode = self.parent.episode(index)
-        return episode.with_columns(last_step_rewards(len(episode), success=self.successes[index]))
-
-
 def _short(numbers: "Sequence[str]") -> str:
     return ", ".join(numbers[:10]) + (", …" if len(numbers) > 10 else "")
-
-
-def help() -> str:
-    """Help page."""
-    return help_for(Label)
-
-
-def main(args: list[str]) -> None:
-    """Run from the command line; errors as in ``run_job``."""
-    main_for(Label, args)

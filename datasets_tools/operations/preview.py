@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_cqn.errors import ConfigError
-from lerobot_cqn.schema import dimension_names
+from lerobot_cqn.schema import STATE, dimension_names
 
-from ..decisions.deltas import STATE
 from ..decisions.pauses import Rule
-from ..views.view import Camera, Episode, View
+from ..views.episode import Camera, Episode
+from ..views.view import View
 
 __all__ = ["write_preview"]
 
@@ -78,14 +78,13 @@ def _marked(before: View, after: View, index: int) -> Iterator[NDArray[np.uint8]
     """(H, W, 3) frames of an episode: cameras side by side under a line of text, red where dropped."""
     import cv2
 
-    from ..disk.pictures import shaped
-    from .resize import picture_size
+    from ..disk.pictures import picture_size, shaped
 
     episode = before.episode(index)
     kept = _kept(episode, after)
     sizes = {k: picture_size(before.features[k]) for k in before.cameras}
     shapes = {k: Camera(size=(HEIGHT, max(2, round(w * HEIGHT / h / 2) * 2))) for k, (h, w) in sizes.items()}
-    for row, pictures in enumerate(before.source.camera_frames(episode, np.arange(len(episode)), before.cameras)):
+    for row, pictures in enumerate(before.camera_frames(episode, np.arange(len(episode)))):
         view = np.concatenate([shaped(pictures[k], shapes[k]) for k in pictures], axis=1)
         strip = np.full((STRIP, view.shape[1], 3), 24 if kept[row] else RED, dtype=np.uint8)
         if not kept[row]:

@@ -1,26 +1,20 @@
 """``cqn-data run``: several operations from a YAML recipe as one pass; frames are decoded once and encoded once."""
 
+import dataclasses
+import json
 from collections.abc import Mapping
-from importlib import import_module, resources
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from lerobot_cqn.errors import ConfigError, one_of
+
 from ..terminal.options import help_page, parse
 from .job import Job, Step, run_job
+from .registry import STEPS, step_class
 
-__all__ = ["STEPS", "help", "load_recipe", "main"]
+__all__ = ["help", "load_recipe", "main"]
 
-# Operation -> its class in the module of its name.
-STEPS = {
-    "filter": "Filter",
-    "trim": "Trim",
-    "delta": "Delta",
-    "resample": "Resample",
-    "resize": "Resize",
-    "label": "Label",
-    "bounds": "SetBounds",
-    "drop": "Drop",
-}
 EXAMPLE = """
 cqn-data run paper_real_world --repo_id=local/pick --root=data/pick --new_repo_id=local/pick_cqn \\
     --new_root=data/pick_cqn
@@ -28,7 +22,7 @@ cqn-data run my_recipe.yaml --repo_id=local/pick --root=data/pick --filter.thres
 """
 
 
-def help() -> str:
+def help(summary: str) -> str:
     """Help page."""
     shipped = "\n\n".join(f"{name}:\n{_text(path)}" for name, path in _shipped().items())
     notes = (
@@ -36,13 +30,11 @@ def help() -> str:
         "--STEP.OPTION=VALUE changes or adds a setting of a step; cqn-data STEP --help explains its options.\n\n"
         f"{shipped}"
     )
-    return help_page("run", "run several operations as one pass over the videos", Job, EXAMPLE, notes)
+    return help_page("cqn-data run", summary, Job, EXAMPLE, notes)
 
 
 def main(args: list[str]) -> None:
     """Run from the command line; errors as in :func:`load_recipe` and ``run_job``."""
-    from lerobot_cqn.errors import ConfigError
-
     if not args or args[0].startswith("--"):
         raise ConfigError(f"Name a recipe first: cqn-data run FILE.yaml --…; shipped: {', '.join(_shipped())}.")
     changes = [
@@ -53,7 +45,7 @@ def main(args: list[str]) -> None:
 
 
 def load_recipe(name: str, changes: list[str] | None = None) -> list[Step]:
-    """Read a recipe.
+    """Steps of a recipe.
 
     Args:
         name: a file, or the name of a shipped recipe.
@@ -63,8 +55,6 @@ def load_recipe(name: str, changes: list[str] | None = None) -> list[Step]:
         ConfigError: no such file, not a recipe, or an unknown step or setting.
     """
     import yaml
-
-    from lerobot_cqn.errors import ConfigError, one_of
 
     path: Any = Path(name) if Path(name).is_file() else _shipped().get(name)
     if path is None:
@@ -101,19 +91,14 @@ def load_recipe(name: str, changes: list[str] | None = None) -> list[Step]:
 
 
 def _step(recipe: str, operation: str, given: dict[str, Any]) -> Step:
-    import dataclasses
-    import json
-
-    from lerobot_cqn.errors import ConfigError, one_of
-
-    step_class: type[Step] = getattr(import_module(f".{operation}", __package__), STEPS[operation])
-    known = [f.name for f in dataclasses.fields(step_class)]  # type: ignore[arg-type]
+    kind = step_class(operation)
+    known = [f.name for f in dataclasses.fields(kind)]  # type: ignore[arg-type]
     for option in given:
         if option not in known:
             raise ConfigError(f"{recipe}: " + one_of(f"setting of {operation}", str(option), known))
     flags = [f"--{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in given.items() if v is not None]
     try:
-        return parse(step_class, flags)
+        return parse(kind, flags)
     except ConfigError as error:
         raise ConfigError(f"{recipe}, step {operation}: {error}") from error
 

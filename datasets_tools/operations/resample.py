@@ -1,20 +1,19 @@
 """``cqn-data resample``: fewer steps a second, e.g. 30 -> 10; no command or reward in between is lost."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
+from lerobot_cqn.errors import ConfigError
 
 from ..terminal.console import result
 from ..terminal.options import option
-from ..views.view import Bounds, Episode, View
-from .job import Step, help_for, main_for, settings_of
+from .job import Step, settings_of
 
 if TYPE_CHECKING:
-    from ..decisions.deltas import Deltas
+    from ..views.view import DerivedView, View
 
-__all__ = ["Resample", "Resampled", "help", "main", "windows"]
+__all__ = ["Resample"]
 
 
 @dataclasses.dataclass
@@ -22,7 +21,6 @@ class Resample(Step):
     """Settings of ``cqn-data resample``."""
 
     name = "resample"
-    summary = "take fewer steps a second"
     example = """
 cqn-data resample --repo_id=local/click --root=data/click --new_root=data/click_5hz --fps=5
 """
@@ -35,14 +33,12 @@ that they connect the states), the sum of the rewards in between, and done or su
 
     def validate(self) -> None:
         """Check ranges; raises ConfigError."""
-        from lerobot_cqn.errors import ConfigError
-
         if self.fps < 1:
             raise ConfigError(f"Expected --fps >= 1, got {self.fps}.")
 
-    def on(self, view: View) -> View:
-        """Raises ConfigError for a rate that would need frames that do not exist."""
-        from lerobot_cqn.errors import ConfigError
+    def on(self, view: "View") -> "DerivedView":
+        """The view at the lower rate; raises ConfigError for one that would need frames that do not exist."""
+        from ..views.resampled import Resampled
 
         if self.fps >= view.fps:
             raise ConfigError(
@@ -55,57 +51,9 @@ that they connect the states), the sum of the rewards in between, and done or su
         after.entry.update(settings=settings_of(self) | {"from_fps": view.fps}, total={"steps": old, "kept": new})
         return after
 
-
-@dataclasses.dataclass
-class Resampled(View):
-    """With fewer steps a second."""
-
-    rate: int = 1
-
-    @property
-    def fps(self) -> int:
-        """The new rate."""
-        return self.rate
-
-    @property
-    def bounds(self) -> Bounds | None:
-        """Those of the view before were for other steps."""
-        return None
-
-    def episode(self, index: int) -> Episode:
-        """The chosen steps."""
-        return _resampled(self.parent.episode(index), self.parent.fps, self.rate, self.parent.deltas)
-
-
-def windows(steps: int, old: int, new: int) -> NDArray[np.int64]:
-    """(K,) first row of each new step; the rows until the next one belong to it. ``new`` < ``old``, in Hz."""
-    count = -(-steps * new // old)
-    starts: NDArray[np.int64] = np.floor(np.arange(count) * (old / new) + 0.5).astype(np.int64)
-    return starts[starts < steps]
-
-
-def _resampled(episode: Episode, old: int, new: int, deltas: "Deltas | None") -> Episode:
-    from lerobot_cqn.schema import NEXT_DONE, NEXT_REWARD, NEXT_SUCCESS
-
-    from ..decisions.deltas import select
-
-    rows = windows(len(episode), old, new)
-    last = np.append(rows[1:], len(episode)) - 1
-    chosen = select(episode, rows, deltas, action_rows=last)
-    joined: dict[str, Any] = {}
-    if NEXT_REWARD in episode.columns:
-        joined[NEXT_REWARD] = np.add.reduceat(episode.columns[NEXT_REWARD], rows, axis=0)
-    for key in (NEXT_DONE, NEXT_SUCCESS, "next.truncated"):
-        if key in episode.columns:
-            joined[key] = np.logical_or.reduceat(episode.columns[key], rows, axis=0)
-    return chosen.with_columns(joined)
-
-
-def help() -> str:
-    """Help page."""
-    return help_for(Resample)
-
-
-def main(args: list[str]) -> None:
-    """Run from the command line; errors as in ``run_job``."""
-    main_for(Resample, args)
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """The sentence for the history."""
+        total, settings = entry["total"], entry["settings"]
+        rates = f"{settings['fps']} steps a second instead of {settings['from_fps']}"
+        return f"Took {rates}: {total['steps']} steps became {total['kept']}."

@@ -1,13 +1,19 @@
 """``cqn-data resize``: smaller pictures, e.g. 480x640 -> 84x84, cut out first where asked."""
 
 import dataclasses
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from lerobot_cqn.errors import ConfigError, one_of
+from lerobot_cqn.story import shown
 
 from ..terminal.console import note, table
-from ..views.view import Camera, View
-from .job import Step, help_for, main_for, settings_of
+from .job import Step, settings_of
 
-__all__ = ["Resize", "help", "main"]
+if TYPE_CHECKING:
+    from ..views.view import DerivedView, View
+
+__all__ = ["Resize"]
 
 
 @dataclasses.dataclass
@@ -15,7 +21,6 @@ class Resize(Step):
     """Settings of ``cqn-data resize``."""
 
     name = "resize"
-    summary = "scale the pictures, and cut them out first where asked"
     example = """
 cqn-data resize --repo_id=local/pick --root=data/pick --new_root=data/pick_84 --size='[84, 84]'
 cqn-data resize --repo_id=local/pick --root=data/pick --new_root=data/pick_84 --size='[84, 84]' \\
@@ -38,8 +43,6 @@ alias. A camera may be named in full (observation.images.top) or by its last par
 
     def validate(self) -> None:
         """Check sizes; raises ConfigError naming the option, what was expected and what was found."""
-        from lerobot_cqn.errors import ConfigError
-
         if len(self.size) != 2 or not all(32 <= n <= 4096 for n in self.size):
             raise ConfigError(f"Expected --size='[HEIGHT, WIDTH]' with 32 to 4096 pixels each, got {self.size}.")
         if any(n % 2 for n in self.size):
@@ -48,9 +51,11 @@ alias. A camera may be named in full (observation.images.top) or by its last par
             if len(box) != 4 or min(box[:2]) < 0 or min(box[2:]) < 2:
                 raise ConfigError(f"Expected --crop='{{\"{name}\": [top, left, height, width]}}', got {box}.")
 
-    def on(self, view: View) -> View:
+    def on(self, view: "View") -> "DerivedView":
         """Check crops against the pictures; raises ConfigError for an unknown camera or a box outside."""
-        from lerobot_cqn.errors import ConfigError
+        from ..disk.pictures import picture_size
+        from ..views.episode import Camera
+        from ..views.resized import Resized
 
         if not view.cameras:
             raise ConfigError(
@@ -82,48 +87,19 @@ alias. A camera may be named in full (observation.images.top) or by its last par
         after.entry.update(settings=settings_of(self))
         return after
 
-
-@dataclasses.dataclass
-class Resized(View):
-    """With other picture sizes."""
-
-    shapes: dict[str, Camera] = dataclasses.field(default_factory=dict)
-
-    @property
-    def cameras(self) -> dict[str, Camera]:
-        """What becomes of each camera's pictures."""
-        return self.shapes
-
-    @property
-    def features(self) -> dict[str, dict[str, Any]]:
-        """With the new shapes, (H, W, 3)."""
-        names = ["height", "width", "channels"]
-        new = {k: {"shape": (*c.size, 3), "names": names} for k, c in self.shapes.items() if c.size}
-        return {k: {**f, **new.get(k, {})} for k, f in self.parent.features.items()}
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """The sentence for the history."""
+        (height, width), crop = entry["settings"]["size"], entry["settings"].get("crop")
+        if not crop:
+            return f"Scaled the pictures to {height}x{width}."
+        parts = f"{shown(crop)}: top, left, height, width"
+        return f"Cut out parts of the pictures ({parts}), then scaled them to {height}x{width}."
 
 
-def picture_size(feature: dict[str, Any]) -> tuple[int, int]:
-    """Height and width of a camera's pictures, whichever axis its channels are."""
-    shape, names = feature["shape"], feature.get("names")
-    channels_first = names[0] in ("channels", "channel") if isinstance(names, list) else shape[0] in (1, 3)
-    height, width = shape[1:] if channels_first else shape[:2]
-    return int(height), int(width)
-
-
-def _camera(view: View, name: str) -> str:
-    from lerobot_cqn.errors import ConfigError, one_of
+def _camera(view: "View", name: str) -> str:
 
     found = [k for k in view.cameras if name in (k, k.rsplit(".", 1)[-1])]
     if len(found) != 1:
         raise ConfigError(one_of("camera", name, view.cameras))
     return found[0]
-
-
-def help() -> str:
-    """Help page."""
-    return help_for(Resize)
-
-
-def main(args: list[str]) -> None:
-    """Run from the command line; errors as in ``run_job``."""
-    main_for(Resize, args)

@@ -1,16 +1,21 @@
 """``cqn-data trim``: cut the heads and tails of episodes, by steps, seconds, motion, or after the first success."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
+
+from lerobot_cqn.errors import ConfigError, DataError
+from lerobot_cqn.schema import ACTION, NEXT_REWARD, NEXT_SUCCESS, STATE
 
 from ..terminal.console import table
 from ..terminal.options import option
-from .job import Step, help_for, main_for, settings_of
+from .job import Step, settings_of
 
 if TYPE_CHECKING:
-    from ..views.view import Episode, View
+    from ..views.episode import Episode
+    from ..views.view import DerivedView, View
 
-__all__ = ["Trim", "help", "main"]
+__all__ = ["Trim"]
 
 
 @dataclasses.dataclass
@@ -18,7 +23,6 @@ class Trim(Step):
     """Settings of ``cqn-data trim``."""
 
     name = "trim"
-    summary = "cut heads and tails of episodes"
     example = """
 cqn-data trim --repo_id=local/click --root=data/click --new_root=data/click_trimmed --motion --auto --keep_still=5
 cqn-data trim --repo_id=local/click --root=data/click --head_seconds=0.5 --tail=3 --dry_run
@@ -40,8 +44,6 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
 
     def validate(self) -> None:
         """Check ranges; raises ConfigError naming the option, the range and the value."""
-        from lerobot_cqn.errors import ConfigError
-
         for name in ("head", "tail", "head_seconds", "tail_seconds", "keep_still"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ConfigError(f"Expected --{name} >= 0, got {getattr(self, name)}.")
@@ -59,12 +61,9 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
 
         return Filter(threshold=self.threshold, auto=self.auto)
 
-    def on(self, view: "View") -> "View":
+    def on(self, view: "View") -> "DerivedView":
         """Find where each episode begins and ends; raises DataError where too little or a reward would be lost."""
         import numpy as np
-
-        from lerobot_cqn.errors import ConfigError, DataError
-        from lerobot_cqn.schema import NEXT_REWARD, NEXT_SUCCESS
 
         from ..decisions.rewards import carries_reward
         from ..views.selected import Selected
@@ -106,11 +105,15 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
         after.entry.update(settings=settings_of(self), episodes=episodes)
         return after
 
+    @staticmethod
+    def told(entry: Mapping[str, Any]) -> str:
+        """The sentence for the history."""
+        head, tail = (sum(e[k] for e in entry["episodes"]) for k in ("head", "tail"))
+        return f"Cut {head} steps off the starts and {tail} off the ends of {len(entry['episodes'])} episodes."
+
     def _success(self, episode: "Episode") -> int | None:
         """First successful step, if there is one and it matters."""
         import numpy as np
-
-        from lerobot_cqn.schema import NEXT_REWARD, NEXT_SUCCESS
 
         if not self.after_success:
             return None
@@ -123,7 +126,6 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
         """The part from the first motion to the last, with the still steps asked for around it."""
         import numpy as np
 
-        from ..decisions.deltas import ACTION, STATE
         from ..decisions.pauses import keep_mask
 
         state, action = (episode.columns[k][start:stop] for k in (STATE, ACTION))
@@ -133,13 +135,3 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
         # The step after the last motion holds the state it led to.
         first, last = start + int(moves[0]), start + int(moves[-1]) + 1
         return max(start, first - self.keep_still), min(stop, last + 1 + self.keep_still)
-
-
-def help() -> str:
-    """Help page."""
-    return help_for(Trim)
-
-
-def main(args: list[str]) -> None:
-    """Run from the command line; errors as in ``run_job``."""
-    main_for(Trim, args)

@@ -1,4 +1,4 @@
-"""What a person sees: result tables on stdout, progress and notes on stderr, no library chatter."""
+"""Output for a person: result tables on stdout, progress and notes on stderr, no library chatter."""
 
 import logging
 import os
@@ -10,6 +10,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
+
+from lerobot_cqn.errors import CQNError
 
 __all__ = ["Interrupted", "explain", "load_lerobot", "note", "progress", "quiet", "result", "table"]
 
@@ -57,8 +59,6 @@ def explain(program: str, error: Exception, *, debug: bool = False) -> int:
 
     debug: the traceback comes first.
     """
-    from lerobot_cqn.errors import CQNError
-
     if debug:
         traceback.print_exception(error)
     text = " ".join(str(error).split()) or type(error).__name__

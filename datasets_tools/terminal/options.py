@@ -1,13 +1,15 @@
 """LeRobot-style flags for one operation: ``--name=value`` into a dataclass, and a help page from the same."""
 
-import contextlib
 import dataclasses
-import io
 import textwrap
 from collections.abc import Sequence
 from typing import Any
 
-__all__ = ["help_page", "option", "parse", "parse_all"]
+from lerobot_cqn.errors import ConfigError, one_of
+
+from .mistakes import one_line
+
+__all__ = ["help_page", "option", "parse", "parse_all", "parse_choice", "with_plugins"]
 
 
 def option(default: Any = dataclasses.MISSING, *, help: str) -> Any:
@@ -16,13 +18,13 @@ def option(default: Any = dataclasses.MISSING, *, help: str) -> Any:
 
 
 def parse[Config](config_class: type[Config], args: Sequence[str]) -> Config:
-    """Read flags into one dataclass; errors as in :func:`parse_all`."""
+    """One dataclass from flags; errors as in :func:`parse_all`."""
     config: Config = parse_all((config_class,), args)[0]
     return config
 
 
 def parse_all(config_classes: Sequence[type], args: Sequence[str]) -> tuple[Any, ...]:
-    """Read flags into dataclasses that share one command line.
+    """Dataclasses from flags that share one command line.
 
     Args:
         config_classes: dataclasses whose fields are made by :func:`option`; no name occurs twice.
@@ -34,8 +36,6 @@ def parse_all(config_classes: Sequence[type], args: Sequence[str]) -> tuple[Any,
     Raises:
         ConfigError: unknown flag (with the nearest one), missing required flag, or a value of another type.
     """
-    from lerobot_cqn.errors import ConfigError, one_of
-
     owners = {f.name: (c, f) for c in config_classes for f in dataclasses.fields(c)}
     given: list[str] = []
     flags: dict[type, list[str]] = {c: [] for c in config_classes}
@@ -62,34 +62,58 @@ def parse_all(config_classes: Sequence[type], args: Sequence[str]) -> tuple[Any,
     missing = [n for n, (_, f) in owners.items() if _required(f) and n not in given]
     if missing:
         raise ConfigError(f"Missing {', '.join(f'--{n}=…' for n in missing)}; --help shows an example.")
-    return tuple(_decode(c, flags[c]) for c in config_classes)
-
-
-def _decode(config_class: type, flags: list[str]) -> Any:
     import draccus
-    from draccus.utils import DecodingError, ParsingError
 
-    from lerobot_cqn.errors import ConfigError, CQNError
+    with one_line(lambda: [f"--{f}" for f in owners], prefix="Bad option value: "):
+        return tuple(draccus.parse(c, args=flags[c]) for c in config_classes)
 
-    captured = io.StringIO()
+
+def parse_choice(group: str, registry: Any, args: Sequence[str]) -> Any:
+    """The dataclass that LeRobot knows as NAME, from ``--GROUP.type=NAME --GROUP.OPTION=VALUE …``.
+
+    Args:
+        group: e.g. "env".
+        registry: the base class of the choices, e.g. LeRobot's ``EnvConfig``.
+        args: options of the group only.
+
+    Raises:
+        ConfigError: no type or an unknown one; otherwise as in :func:`parse_all`, with the type named.
+    """
+    settings = [a.replace(f"--{group}.", "--", 1).partition("=") for a in args]
+    kinds = [value for name, _, value in settings if name == "--type"]
+    known = registry.get_known_choices()
+    if not kinds or not kinds[-1]:
+        raise ConfigError(f"Missing --{group}.type=NAME; known: {', '.join(known)}.")
+    kind = kinds[-1]
+    if kind not in known:
+        raise ConfigError(one_of(f"--{group}.type", kind, known))
     try:
-        with contextlib.redirect_stderr(captured):
-            return draccus.parse(config_class, args=flags)
-    except DecodingError as error:
-        raise ConfigError(f"Bad option value: {' '.join(str(error).split())}") from error
-    except ParsingError as error:
-        cause = error.__cause__ or error.__context__ or error
-        if isinstance(cause, CQNError):  # the class checks its own values and says it best
-            raise cause from None
-        raise ConfigError(f"Bad option value: {' '.join(str(cause).split())}") from error
-    except SystemExit as error:
-        lines = captured.getvalue().strip().splitlines() or ["unreadable options"]
-        raise ConfigError(lines[-1].removeprefix("-: error: ")) from error
+        return parse(known[kind], ["".join(setting) for setting in settings if setting[0] != "--type"])
+    except ConfigError as error:
+        raise ConfigError(f"--{group}.type={kind}: {error}") from error
 
 
-def help_page(name: str, summary: str, config: type | tuple[type, ...], example: str, extra: str = "") -> str:
-    """Help text of an operation: what it does, an example that can be pasted, every flag with its default."""
-    lines = [f"cqn-data {name}: {summary}", "", "Example:", textwrap.indent(example.strip("\n"), "  "), ""]
+def with_plugins(args: Sequence[str]) -> list[str]:
+    """The arguments without ``--env.discover_packages_path=PACKAGE``, whose packages have registered what they hold.
+
+    Raises:
+        ConfigError: a package that cannot be imported.
+    """
+    from lerobot.configs import parser
+
+    rest = list(args)
+    for flag, package in parser.parse_plugin_args(parser.PLUGIN_DISCOVERY_SUFFIX, rest).items():
+        try:
+            parser.load_plugin(package)
+        except parser.PluginLoadError as error:
+            raise ConfigError(f"--{flag}={package}: {error}") from error
+        rest = parser.filter_arg(flag, rest)
+    return rest
+
+
+def help_page(command: str, summary: str, config: type | tuple[type, ...], example: str, extra: str = "") -> str:
+    """Help text of a command: what it does, an example that can be pasted, every flag with its default."""
+    lines = [f"{command}: {summary}", "", "Example:", textwrap.indent(example.strip("\n"), "  "), ""]
     lines.append("Options:")
     for field in (f for c in (config if isinstance(config, tuple) else (config,)) for f in dataclasses.fields(c)):
         text = field.metadata.get("help", "")

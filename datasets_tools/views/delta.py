@@ -5,19 +5,21 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_cqn.schema import dimension_names
+from lerobot_cqn.delta_actions import DeltaJoints
+from lerobot_cqn.schema import ACTION, STATE
 
-from ..decisions.deltas import ACTION, STATE, Deltas, absolute_action, delta_action
-from .view import Bounds, Episode, View
+from ..decisions.deltas import absolute_action, delta_action
+from .episode import Bounds, Episode
+from .view import DerivedView
 
-__all__ = ["AbsoluteView", "DeltaView", "described"]
+__all__ = ["AbsoluteView", "DeltaView"]
 
 
 @dataclass
-class DeltaView(View):
+class DeltaView(DerivedView):
     """With some action dimensions as differences; where there were no actions, they are made from the states."""
 
-    made: Deltas | None = None
+    made: DeltaJoints | None = None
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:
@@ -26,8 +28,8 @@ class DeltaView(View):
         return features if ACTION in features else {**features, ACTION: dict(features[STATE])}
 
     @property
-    def deltas(self) -> Deltas | None:
-        """What the actions are now."""
+    def deltas(self) -> DeltaJoints | None:
+        """Those that this view has made."""
         return self.made
 
     @property
@@ -42,16 +44,16 @@ class DeltaView(View):
             state = episode.columns[STATE]
             episode = episode.with_columns({ACTION: np.concatenate([state[1:], state[-1:]])})
         assert self.made is not None  # noqa: S101  # set by whoever made this view
-        return episode.with_columns({ACTION: delta_action(episode, self.made)})
+        return episode.with_columns({ACTION: delta_action(episode.columns, self.made)})
 
 
 @dataclass
-class AbsoluteView(View):
+class AbsoluteView(DerivedView):
     """With all action dimensions absolute."""
 
     @property
-    def deltas(self) -> Deltas | None:
-        """None."""
+    def deltas(self) -> DeltaJoints | None:
+        """None: all actions are absolute."""
         return None
 
     @property
@@ -62,15 +64,4 @@ class AbsoluteView(View):
     def episode(self, index: int) -> Episode:
         """The steps with absolute actions."""
         episode, deltas = self.parent.episode(index), self.parent.deltas
-        return episode if deltas is None else episode.with_columns({ACTION: absolute_action(episode, deltas)})
-
-
-def described(view: View, deltas: Deltas) -> dict[str, Any]:
-    """Deltas by the names of their dimensions, as the history keeps them."""
-    states = dimension_names(view.features[STATE])
-    actions = dimension_names(view.features.get(ACTION, view.features[STATE]))
-    return {
-        "kind": deltas.kind,
-        "action": [actions[i] for i in deltas.action_dims],
-        "state": [states[i] for i in deltas.state_dims],
-    }
+        return episode if deltas is None else episode.with_columns({ACTION: absolute_action(episode.columns, deltas)})

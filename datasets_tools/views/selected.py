@@ -1,4 +1,4 @@
-"""A view without the pauses of its episodes."""
+"""Views of some rows of some episodes, such as those without the pauses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -7,19 +7,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_cqn.delta_actions import DeltaJoints
 from lerobot_cqn.errors import DataError
+from lerobot_cqn.schema import ACTION, STATE
 
-from ..decisions.deltas import ACTION, STATE, absolute_action, select
+from ..decisions.deltas import absolute_action, delta_action
+from ..decisions.joints import match_joints
 from ..decisions.pauses import EpisodeReport, Rule, keep_mask, report_episode
 from ..decisions.rewards import carries_reward
-from .readable import match_joints
-from .view import Bounds, Episode, View
+from .episode import Bounds, Episode
+from .view import DerivedView, View
 
-__all__ = ["Selected", "filtered_view"]
+__all__ = ["Selected", "filtered_view", "select"]
 
 
 @dataclass
-class Selected(View):
+class Selected(DerivedView):
     """Some rows of some episodes.
 
     Attributes:
@@ -41,6 +44,25 @@ class Selected(View):
     def episode(self, index: int) -> Episode:
         """The chosen rows, delta actions formed anew."""
         return select(self.parent.episode(index), self.rows[index], self.parent.deltas)
+
+
+def select(
+    episode: Episode, rows: NDArray[np.int64], deltas: DeltaJoints | None, action_rows: NDArray[np.int64] | None = None
+) -> Episode:
+    """Some rows of an episode, with delta actions formed anew so that they connect the states that are left.
+
+    Args:
+        episode: the steps before.
+        rows: (K,) ascending rows to keep.
+        deltas: what the actions are; None for absolute ones, which do not depend on their neighbours.
+        action_rows: (K,) where each step's command is taken from; by default its own row.
+    """
+    chosen = episode.at(rows)
+    if ACTION not in episode.columns or (deltas is None and action_rows is None):
+        return chosen
+    commanded = episode.columns[ACTION] if deltas is None else absolute_action(episode.columns, deltas)
+    chosen = chosen.with_columns({ACTION: commanded[rows if action_rows is None else action_rows]})
+    return chosen if deltas is None else chosen.with_columns({ACTION: delta_action(chosen.columns, deltas)})
 
 
 def filtered_view(view: View, rule: Rule, min_steps: int, *, skip: bool) -> tuple[Selected, list[EpisodeReport]]:
@@ -81,9 +103,9 @@ def filtered_view(view: View, rule: Rule, min_steps: int, *, skip: bool) -> tupl
 def commanded_joints(view: View, episode: Episode) -> NDArray[Any] | None:
     """(T, J) commanded joint positions, where the actions are joints; None where they cannot be matched."""
     if view.deltas is not None:
-        return absolute_action(episode, view.deltas)[:, list(view.deltas.action_dims)]
+        return absolute_action(episode.columns, view.deltas)[:, list(view.deltas.action_dims)]
     try:
-        actions, _ = match_joints(view)
+        actions, _ = match_joints(view.features)
     except DataError:
         return None
     commanded: NDArray[Any] = episode.columns[ACTION][:, list(actions)]

@@ -20,26 +20,26 @@ INSTALLED_AS = {
 ROOM_MAY_USE: dict[str, tuple[str, ...]] = {
     "lerobot_cqn": (),
     "lerobot_cqn._plugin": ("train.envs", "train.sim_arm"),
-    "datasets_tools": ("lerobot_cqn.schema", "lerobot_cqn.errors", "lerobot_cqn.hub_errors", "lerobot_cqn.story"),
+    "datasets_tools": tuple(
+        f"lerobot_cqn.{name}" for name in ["errors", "schema", "delta_actions", "hub_errors", "story"]
+    ),
     "train": ("lerobot_cqn", "datasets_tools"),
 }
 
-# --- Parts of `train` that know neither one another nor the loop: they meet in the modules named here.
-SEPARATE_PARTS = ("train.envs", "train.robot", "train.operator")
-MEETING_PLACE = "train.interfaces"
-
-# --- Floors of each room, lowest first: a folder, or a file beside folders, uses only those before it. Imports that run
-# later, or only for the type checker, count as well: whoever reads the code follows them all the same.
+# --- Floors of each room, lowest first: a folder, or a file beside folders, uses only itself and those on floors before
+# it; those that share a floor (|) do not know one another. Imports that run later, or only for the type checker, count
+# as well: whoever reads the code follows them all the same.
 FLOORS: dict[str, str] = {
     # tensors in, tensors out, never a configuration (up to losses); then networks; then what LeRobot sees
     "lerobot_cqn": (
-        "errors schema ranges intervals distributional augmentation losses settings networks model critic actor_critic "
-        "learner joint_goals fit_pictures story hub_errors base_config model_card processors base_policy "
-        "configuration_cqn processor_cqn modeling_cqn configuration_drqv2 processor_drqv2 modeling_drqv2"
+        "errors schema|ranges intervals|distributional|augmentation losses settings networks model "
+        "critic|actor_critic|learner delta_actions joint_goals|fit_pictures|story|hub_errors base_config "
+        "model_card|processors base_policy configuration_cqn|configuration_drqv2 processor_cqn|processor_drqv2 "
+        "modeling_cqn|modeling_drqv2"
     ),
-    "datasets_tools": "terminal decisions views disk operations formats inspection hub record cli",
+    "datasets_tools": "terminal decisions views disk operations formats|inspection|hub record|cli",
     "train": (
-        "interfaces envs robot operator sim_arm config agent replay run loop arm push arguments build cli bench demo"
+        "interfaces envs|robot|operator sim_arm|config agent replay run loop arm push|arguments build cli|bench|demo"
     ),
 }
 
@@ -179,16 +179,18 @@ def check_installed_names(source: Source) -> Iterator[str]:
 def check_floors(source: Source) -> Iterator[str]:
     """Within a room imports go down only."""
     room, _, rest = source.module.partition(".")
-    floors, own = FLOORS[room].split(), rest.partition(".")[0]
+    own = rest.partition(".")[0]
     if own in ("", "_plugin"):  # a room's __init__ names what it offers; the plugin is a room of its own
         return
-    if own not in floors:
+    floors = [floor.split("|") for floor in FLOORS[room].split()]
+    number = next((i for i, floor in enumerate(floors) if own in floor), None)
+    if number is None:
         yield f"{source.path}:1 is on no floor of {room}: enter it in FLOORS of tests/architecture/rules.py"
         return
-    below = floors[: floors.index(own) + 1]
+    may = {own}.union(*floors[:number])
     for item in source.imports:
-        if within(item.name, room) and item.name[len(room) + 1 :].partition(".")[0] not in below:
-            yield f"{_at(source, item)} imports {item.name or room}; {own} may use {', '.join(below)}"
+        if within(item.name, room) and item.name[len(room) + 1 :].partition(".")[0] not in may:
+            yield f"{_at(source, item)} imports {item.name or room}; {own} may use {', '.join(sorted(may))}"
 
 
 def circles(sources: list[Source]) -> list[list[str]]:
@@ -214,16 +216,6 @@ def _reached(module: str, uses: dict[str, set[str]]) -> set[str]:
         found |= new
         waiting += new
     return found
-
-
-def check_separate_parts(source: Source) -> Iterator[str]:
-    """Environments, robot and operator page meet only in train/interfaces.py."""
-    part = next((part for part in SEPARATE_PARTS if within(source.module, part)), None)
-    if part is None:
-        return
-    for item in source.imports:
-        if within(item.name, "train") and not _allowed(item.name, (part, MEETING_PLACE)):
-            yield f"{_at(source, item)} imports {item.name}; {part} may use itself and {MEETING_PLACE}"
 
 
 def check_optional(source: Source) -> Iterator[str]:
@@ -268,7 +260,6 @@ ROOM_CHECKS = (
     check_rooms,
     check_relative,
     check_floors,
-    check_separate_parts,
     check_optional,
 )
 EVERYWHERE_CHECKS = (check_installed_names, check_forbidden, check_length)

@@ -10,7 +10,8 @@ import pytest
 from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from cqn_data.cli import OPERATIONS, main
+from cqn_data.cli import main
+from cqn_data.operations.registry import OPERATIONS
 
 from .. import foreign_formats
 from .data_recording import RECIPE

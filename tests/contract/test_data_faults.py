@@ -79,7 +79,7 @@ def test_killed_at_any_moment_the_target_is_complete_or_absent_and_the_next_run_
     folder = tmp_path / "out"
     folder.mkdir()
     target = folder / "dst"
-    with zygote("cqn_data.cli", tmp_path / "log", preload="cqn_data.disk.encode, cqn_data.views.readable") as processes:
+    with zygote("cqn_data.cli", tmp_path / "log", preload="cqn_data.disk.encode, cqn_data.disk.readable") as processes:
         begun = time.monotonic()
         process = processes.start(*arguments(recording, target))
         assert processes.wait(process) == 0

@@ -15,9 +15,9 @@ from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from cqn_data.cli import OPERATIONS, module_of
 from cqn_data.operations.job import Job
-from cqn_data.operations.recipe import STEPS, load_recipe
+from cqn_data.operations.recipe import load_recipe
+from cqn_data.operations.registry import OPERATIONS, STEPS, module_of, step_class
 from cqn_data.terminal.options import parse, parse_all
 from cqn_train import arguments as cqn_train
 from cqn_train.arm.devices import register_devices
@@ -140,7 +140,7 @@ def check_cqn_data(words: Sequence[str]) -> None:
         (job,) = parse_all((Job,), [option for option in options if option not in steps])
         parsed = [job, *load_recipe(recipe, steps)]
     elif operation in STEPS:
-        parsed = list(parse_all((Job, getattr(module, STEPS[operation])), options))
+        parsed = list(parse_all((Job, step_class(operation)), options))
     else:
         (kind,) = [kind for name, kind in vars(module).items() if name == f"{operation.title()}Config"]
         rename = getattr(module, "_python_name", str)
@@ -148,7 +148,7 @@ def check_cqn_data(words: Sequence[str]) -> None:
         settings = [option for option in options if option.startswith("--env.")]
         if settings:
             assert operation == "record"
-            parsed.append(module._env_config(settings))
+            parsed.append(module.env_config(settings))
     for config in parsed:
         getattr(config, "validate", lambda: None)()
 

@@ -12,6 +12,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 
 import cqn_train.envs  # registers the station
 import cqn_train.sim_arm  # noqa: F401  # registers the arm
+import lerobot_cqn
 from cqn_train.arguments import parse
 from cqn_train.config import Recipe, RunConfig
 from lerobot_cqn import settings as settings_module
@@ -25,6 +26,13 @@ ACTION = {"action": PolicyFeature(FeatureType.ACTION, (2,))}
 
 def config(**settings: Any) -> CQNConfig:
     return CQNConfig(device="cpu", **settings)
+
+
+def test_the_package_offers_its_names_and_no_others() -> None:
+    assert all(getattr(lerobot_cqn, name).__name__ == name for name in lerobot_cqn.__all__ if not name.isupper())
+    assert lerobot_cqn.CQNConfig is CQNConfig
+    with pytest.raises(AttributeError, match="no attribute 'CQNPolicyy'"):
+        _ = lerobot_cqn.CQNPolicyy
 
 
 @pytest.mark.parametrize("preset", PRESETS)

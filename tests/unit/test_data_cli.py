@@ -5,7 +5,8 @@ import sys
 
 import pytest
 
-from cqn_data.cli import OPERATIONS, main
+from cqn_data.cli import main
+from cqn_data.operations.registry import OPERATIONS
 
 
 def fails(capsys, *args):
@@ -29,6 +30,37 @@ def test_help_needs_no_heavy_import():
         assert word in done.stdout
 
 
+ANSWERS = """
+import contextlib, io, sys
+from cqn_data.cli import main
+from cqn_data.operations.registry import OPERATIONS
+
+HEAVY = {"torch", "lerobot", "datasets", "pyarrow", "cv2", "av", "mujoco", "transformers", "numpy", "huggingface_hub"}
+
+def answers(code, *args):
+    with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
+        assert main(list(args)) == code, args
+    assert not HEAVY & sys.modules.keys(), (args, HEAVY & sys.modules.keys())
+
+answers(0, "--help")
+answers(2, "filtr")
+for name in OPERATIONS:
+    recipe = ["simulation"] if name == "run" else []
+    answers(0, name, "--help")
+    answers(2, name, *recipe)
+    answers(2, name, *recipe, "--repo_id=a/b", "--nope=1")
+answers(2, "filter", "--repo_id=a/b", "--threshold=abc")
+answers(2, "resize", "--repo_id=a/b", "--size=[a]")
+answers(2, "record", "--repo_id=a/b", "--episodes=x")
+answers(2, "run", "simulation", "--repo_id=a/b", "--filter.threshold=abc")
+"""
+
+
+def test_help_and_usage_errors_load_nothing_heavy():
+    done = subprocess.run([sys.executable, "-c", ANSWERS], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 def test_unknown_operation_names_the_nearest(capsys):
     assert "Did you mean 'filter'?" in fails(capsys, "filtr")
 
@@ -39,6 +71,8 @@ def test_unknown_operation_names_the_nearest(capsys):
         (["--repo_id=a/b", "--treshold=1"], "Did you mean '--threshold'?"),
         ([], "Missing --repo_id"),
         (["--repo_id=a/b", "--threshold=abc"], "threshold"),
+        (["--repo_id=a/b", "--threshold.x=1"], "Did you mean '--threshold'?"),
+        (["--repo_id=a/b", "--joint_thresholds={a"], "Bad option value: while parsing a flow mapping"),
         (["--repo_id=a/b", "--threshold=-1"], "positive"),
         (["--repo_id=a/b", "--threshold=nan"], "positive"),
         (["--repo_id=a/b", "--threshold"], "needs a value"),

@@ -8,28 +8,34 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cqn_data.decisions.deltas import KINDS, Deltas, absolute_action, delta_action, select, to_absolute, to_delta
+from cqn_data.decisions.deltas import absolute_action, delta_action, to_absolute, to_delta
 from cqn_data.decisions.episode_rules import parse_rule
-from cqn_data.operations.bounds import quantile_bounds
+from cqn_data.disk.source import open_source
 from cqn_data.operations.label import Label
-from cqn_data.operations.resample import Resample, Resampled, windows
+from cqn_data.operations.resample import Resample
 from cqn_data.operations.trim import Trim
-from cqn_data.views.selected import Selected
-from cqn_data.views.view import Bounds, Episode, View
+from cqn_data.views.bounded import quantile_bounds
+from cqn_data.views.episode import Bounds, Episode
+from cqn_data.views.resampled import Resampled, windows
+from cqn_data.views.selected import Selected, select
+from cqn_data.views.view import DerivedView, View
+from lerobot_cqn.delta_actions import KINDS, DeltaJoints
 from lerobot_cqn.errors import ConfigError, DataError
 
-JOINTS = Deltas("command", (0, 1), (0, 1))
+from ..toy_datasets import make_dataset
+
+JOINTS = DeltaJoints("command", (0, 1), (0, 1))
 VECTOR = {"dtype": "float32", "shape": (3,), "names": ["a.pos", "b.pos", "gripper.pos"]}
 REWARD = {"dtype": "float32", "shape": (1,), "names": None}
 
 
 @dataclasses.dataclass
-class Memory(View):
+class Memory(DerivedView):
     """A source made of arrays."""
 
     parent: View | None = None
     data: dict = dataclasses.field(default_factory=dict)
-    kind: Deltas | None = None
+    kind: DeltaJoints | None = None
     extra: dict = dataclasses.field(default_factory=dict)
 
     features = property(lambda self: {"observation.state": VECTOR, "action": VECTOR, **self.extra})
@@ -57,7 +63,7 @@ def episodes(draw, kinds=(None, *KINDS), least=1):
     steps = draw(st.integers(least, 30))
     values = arrays(np.float32, (steps, 3), elements=st.floats(-10, 10, width=32))
     kind = draw(st.sampled_from(kinds))
-    deltas = None if kind is None else Deltas(kind, (0, 1), (0, 1))
+    deltas = None if kind is None else DeltaJoints(kind, (0, 1), (0, 1))
     return make_episode(draw(values), draw(values)), deltas
 
 
@@ -68,7 +74,7 @@ def test_absolute_actions_come_back_from_deltas(case):
     back = to_absolute(to_delta(action, state, deltas.kind), state, deltas.kind)
     expected = action if deltas.kind != "state" else np.concatenate([state[1:], action[-1:]])
     np.testing.assert_allclose(back, expected, atol=1e-5)
-    through = delta_action(episode.with_columns({"action": absolute_action(episode, deltas)}), deltas)
+    through = delta_action({**episode.columns, "action": absolute_action(episode.columns, deltas)}, deltas)
     if deltas.kind != "state":
         np.testing.assert_allclose(through, episode.columns["action"], atol=1e-4)
     np.testing.assert_array_equal(through[:, 2], episode.columns["action"][:, 2])  # the gripper stays absolute
@@ -87,8 +93,8 @@ def test_chosen_steps_keep_their_commands_and_connect_their_states(case, data):
     elif deltas.kind == "state":
         np.testing.assert_allclose((state + action)[:-1, :2], state[1:, :2], atol=1e-4)
     else:  # what was commanded at a step is still commanded there
-        before = absolute_action(episode, deltas)[rows]
-        np.testing.assert_allclose(absolute_action(chosen, deltas), before, atol=1e-3)
+        before = absolute_action(episode.columns, deltas)[rows]
+        np.testing.assert_allclose(absolute_action(chosen.columns, deltas), before, atol=1e-3)
 
 
 @given(st.integers(1, 200), st.integers(2, 60), st.data())
@@ -113,8 +119,8 @@ def test_resampling_loses_no_reward_and_no_command(case, rate, data):
     assert after.columns["next.done"].any() == episode.columns["next.done"].any()
     rows = windows(len(episode), 30, rate)
     ends = np.append(rows[1:], len(episode)) - 1
-    wanted = episode.columns["action"] if deltas is None else absolute_action(episode, deltas)
-    got = after.columns["action"] if deltas is None else absolute_action(after, deltas)
+    wanted = episode.columns["action"] if deltas is None else absolute_action(episode.columns, deltas)
+    got = after.columns["action"] if deltas is None else absolute_action(after.columns, deltas)
     np.testing.assert_allclose(got, wanted[ends], atol=1e-3)
 
 
@@ -148,7 +154,7 @@ def test_bounds_leave_out_the_share_asked_for(parts, quantile):
 
 @given(arrays(np.float32, (20, 3), elements=st.floats(-5, 5, width=32)))
 def test_a_margin_widens_differences_and_leaves_absolute_actions(values):
-    view = Memory(data={0: make_episode(np.zeros_like(values), values)}, kind=Deltas("state", (0, 2), (0, 2)))
+    view = Memory(data={0: make_episode(np.zeros_like(values), values)}, kind=DeltaJoints("state", (0, 2), (0, 2)))
     found = quantile_bounds(view, [0], 0.0, margin=0.25)
     low, high = values.min(axis=0).astype(np.float64), values.max(axis=0).astype(np.float64)
     spread = 0.25 * (high - low) * [1, 0, 1]
@@ -162,7 +168,7 @@ def test_bounds_end_where_steps_or_actions_change():
         bounds = property(lambda self: Bounds(np.zeros(3), np.ones(3)))
 
     view = Bounded(data={0: make_episode(np.zeros((4, 3)), np.zeros((4, 3)))})
-    assert View(view).bounds is not None
+    assert DerivedView(view).bounds is not None
     assert Selected(view, rows={0: np.arange(4)}).bounds is None
     assert Resampled(view, rate=10).bounds is None
 
@@ -200,8 +206,9 @@ def three():
     ],
 )
 def test_rules(three, text, expected):
-    rule = parse_rule(text, three)
-    assert [i for i in three.episodes if rule.holds(three.episode(i), three.fps)] == expected
+    rule = parse_rule(text, three.features)
+    cases = {i: three.episode(i) for i in three.episodes}
+    assert [i for i, e in cases.items() if rule.holds(e.columns, len(e), three.fps)] == expected
 
 
 @pytest.mark.parametrize(
@@ -217,7 +224,7 @@ def test_rules(three, text, expected):
 )
 def test_rules_that_cannot_be_read_are_refused_and_never_run(three, text, said):
     with pytest.raises(ConfigError, match=said.replace("?", r"\?")):
-        parse_rule(text, three)
+        parse_rule(text, three.features)
 
 
 def test_labels(three):
@@ -261,3 +268,11 @@ def test_trim_by_motion_leaves_the_still_steps_asked_for(keep, expected):
     view = Memory(data={0: make_episode(state, state)})
     after = Trim(motion=True, threshold=0.5, keep_still=keep).on(view)
     assert (after.episode(0).frames[0], after.episode(0).frames[-1] + 1) == expected
+
+
+def test_a_source_and_what_is_made_of_it_can_be_shown(tmp_path):
+    source = open_source("local/toy", str(make_dataset(tmp_path / "toy")))
+    derived = Selected(source, rows={0: np.arange(3)})
+    assert "Source" in repr(source)
+    assert "Selected" in repr(derived)
+    assert (derived.entry, isinstance(source, View)) == ({}, True)

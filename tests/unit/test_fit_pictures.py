@@ -14,7 +14,7 @@ from lerobot.policies.utils import prepare_observation_for_inference
 from torch import Tensor
 
 from cqn_data.disk.pictures import shaped
-from cqn_data.views.view import Camera
+from cqn_data.views.episode import Camera
 from lerobot_cqn.configuration_cqn import CQNConfig
 from lerobot_cqn.configuration_drqv2 import DrQv2Config
 from lerobot_cqn.fit_pictures import FitPicturesProcessorStep, fitted

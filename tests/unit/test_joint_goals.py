@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,14 +16,13 @@ from lerobot.policies.factory import make_pre_post_processors
 from lerobot.processor import NormalizerProcessorStep
 from lerobot.processor.relative_action_processor import RelativeActionsProcessorStep
 
-from cqn_data.decisions.deltas import KINDS, to_absolute, to_delta
+from cqn_data.decisions.deltas import to_absolute, to_delta
 from lerobot_cqn.configuration_cqn import CQNConfig
 from lerobot_cqn.configuration_drqv2 import DrQv2Config
+from lerobot_cqn.delta_actions import KINDS, DeltaJoints
 from lerobot_cqn.errors import DataError
 from lerobot_cqn.joint_goals import (
-    DeltaJoints,
     DeltaToGoalProcessorStep,
-    Kind,
     RememberJointsProcessorStep,
     action_of,
     converted_deltas,
@@ -47,10 +46,6 @@ def numbers(*shape: int) -> Any:
 
 
 # -- the maths ---------------------------------------------------------------------------------------------------------
-
-
-def test_the_kinds_are_those_of_the_dataset_tools() -> None:
-    assert get_args(Kind) == KINDS
 
 
 @pytest.mark.parametrize("kind", [None, *KINDS])
