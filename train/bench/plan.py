@@ -12,6 +12,7 @@ import yaml
 from lerobot_cqn.errors import ConfigError, one_of
 
 from ..run.metrics import read_rows
+from ..run.progress import last_line
 
 __all__ = ["Plan", "Run", "load_plan", "runs_of"]
 
@@ -51,8 +52,7 @@ class Run:
     def last_words(self) -> str:
         """Last line of its log, and where it is."""
         path = self.folder.with_suffix(".log")
-        lines = path.read_text(errors="replace").split("\n") if path.is_file() else []
-        said = next((line.strip() for line in reversed(lines) if line.strip()), "")
+        said = last_line(path)
         return f"{said} (log: {path})" if said else f"see {path}"
 
     @property

@@ -8,24 +8,23 @@ import json
 import os
 import secrets
 import sys
-import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from ..interfaces import PAGE_TOKEN
 from ..run.metrics import read_rows
+from ..run.progress import last_line
 from .config import ArmDemoConfig
-from .stages import Stages, fresh, run_once
+from .stages import Stages, Watched, fresh, run_once
 
 __all__ = ["main", "run_demo"]
 
 CLOCK = 4  # simulated seconds in a real one
 RATE = 10  # control steps in a simulated second
-LOG_EVERY_S = 30.0
 
 
 def run_demo(config: ArmDemoConfig, console: Console) -> dict[str, Any]:
@@ -62,7 +61,7 @@ def run_demo(config: ArmDemoConfig, console: Console) -> dict[str, Any]:
             for row in evaluations
             if (phase := row["phase"]) in ("offline", "final")
         },
-        "control": _last_line(stages.logs / "train.log", "Control:"),
+        "control": last_line(stages.logs / "train.log", "Control:"),
     }
     (config.output_dir / "session.png").write_bytes(arm_session(episodes, evaluations))
     (config.output_dir / "summary.json").write_text(json.dumps(summary, indent=2))
@@ -91,22 +90,10 @@ def _train(stages: Stages, config: ArmDemoConfig, data: Path, run: Path, arm: tu
     process = stages.start("train", "cqn_train.cli", *arguments)
     page = f"http://127.0.0.1:{config.port}/?token={stages.environment[PAGE_TOKEN]}"
     stages.console.print(f"  watch it at the operator's page: {page}", soft_wrap=True)
-    columns = (TextColumn("  {task.description}"), BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("eta"),
-               TimeRemainingColumn(), TextColumn("{task.fields[note]}"))  # fmt: skip
-    with Progress(*columns, console=stages.console) as bar:
-        task, told = bar.add_task("online training", total=config.steps, note="imitation first"), time.monotonic()
-        try:
-            while process.poll() is None:
-                done, note = _progress(run, config)
-                bar.update(task, completed=done, note=note)
-                if not stages.console.is_terminal and time.monotonic() - told > LOG_EVERY_S:
-                    told = time.monotonic()
-                    stages.console.print(f"  online training {done}/{config.steps}  {note}")
-                time.sleep(1.0)
-        except KeyboardInterrupt:  # it has received the signal too, and is saving
-            process.wait()
-            raise
-    stages.check("train", process.returncode)
+    training = Watched(
+        process=process, text="online training", total=config.steps, progress=partial(_progress, run, config)
+    )
+    stages.watch({"train": training})
 
 
 def _progress(run: Path, config: ArmDemoConfig) -> tuple[int, str]:
@@ -122,11 +109,6 @@ def _progress(run: Path, config: ArmDemoConfig) -> tuple[int, str]:
 def _online_minutes(run: Path) -> float:
     progress = json.loads((run / "checkpoints/last/training_state/progress.json").read_text())
     return float(progress["counters"]["online_s"]) / 60
-
-
-def _last_line(log: Path, begin: str) -> str:
-    lines = [line.strip() for line in log.read_text(errors="replace").splitlines()]
-    return next((line for line in reversed(lines) if line.startswith(begin)), "")
 
 
 def show(summary: dict[str, Any], config: ArmDemoConfig, console: Console) -> None:

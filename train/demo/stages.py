@@ -5,22 +5,38 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import draccus
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from cqn_data.terminal.console import explain
 from lerobot_cqn.errors import CQNError
 
-__all__ = ["DemoError", "Stages", "fresh", "run_once"]
+from ..run.progress import last_line
+
+__all__ = ["DemoError", "Stages", "Watched", "fresh", "run_once"]
+
+LOG_EVERY_S = 30.0  # between lines where there is no terminal for a bar
 
 
 class DemoError(CQNError):
     """A command of the demo failed; the message names its log."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Watched:
+    """A running command, and how far it is: `progress` gives the units done of `total`, and a note."""
+
+    process: subprocess.Popen[bytes]
+    text: str
+    total: int
+    progress: Callable[[], tuple[int, str]]
 
 
 class Stages:
@@ -61,8 +77,9 @@ class Stages:
         """Raise DemoError with the last line of the log when a command failed."""
         if code:
             log = self.logs / f"{name}.log"
-            lines = log.read_text(errors="replace").strip().splitlines() or ["no output"]
-            raise DemoError(f"'{name}' failed with exit code {code}: {lines[-1]} (all of it in {log})")
+            raise DemoError(
+                f"'{name}' failed with exit code {code}: {last_line(log) or 'no output'} (all of it in {log})"
+            )
 
     def run(self, name: str, text: str, target: Path, module: str, *arguments: str) -> None:
         """Run a command that makes the folder `target`, unless an earlier start has finished it."""
@@ -81,6 +98,32 @@ class Stages:
             self.check(name, code)
         finished.touch()
         self.console.print(f"  {text:<58} {time.monotonic() - begun:5.0f} s")
+
+    def watch(self, running: Mapping[str, Watched]) -> None:
+        """Show a bar for each command until all have ended. Raises DemoError when one has failed."""
+        columns = (
+            TextColumn("  {task.description:<26}"), BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("eta"),
+            TimeRemainingColumn(), TextColumn("{task.fields[note]}"),
+        )  # fmt: skip
+        told = time.monotonic()
+        with Progress(*columns, console=self.console) as bars:
+            tasks = {name: bars.add_task(one.text, total=one.total, note="") for name, one in running.items()}
+            try:
+                while any(one.process.poll() is None for one in running.values()):
+                    tell = not self.console.is_terminal and time.monotonic() - told > LOG_EVERY_S
+                    for name, one in running.items():
+                        done, note = one.progress()
+                        bars.update(tasks[name], completed=done, note=note)
+                        if tell:
+                            self.console.print(f"  {one.text:<26} {done}/{one.total}  {note}")
+                    told = time.monotonic() if tell else told
+                    time.sleep(1.0)
+            except KeyboardInterrupt:
+                for one in running.values():  # they have received the signal too, and are saving
+                    one.process.wait()
+                raise
+        for name, one in running.items():
+            self.check(name, one.process.returncode)
 
 
 def fresh(run: Path) -> Path:

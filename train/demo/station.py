@@ -4,23 +4,20 @@ Runs the same commands a user would type, two trainings at a time on one thread 
 Interrupted at any moment, it continues where it was when started again.
 """
 
-import subprocess
 import sys
-import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from ..run.metrics import read_rows
 from .config import DemoConfig
-from .stages import Stages, fresh, run_once
+from .stages import Stages, Watched, fresh, run_once
 
 __all__ = ["main", "run_demo"]
 
-LOG_EVERY_S = 30.0  # between lines where there is no terminal for a bar
 VARIANTS = {"filtered": "pauses dropped", "unfiltered": "pauses kept"}
 ENV = ("--env.type=ur5e_station", "--env.task=click_button")
 
@@ -55,8 +52,9 @@ def _prepare_and_train(stages: Stages, config: DemoConfig) -> None:
 
 def train(stages: Stages, config: DemoConfig, data: dict[str, Path]) -> None:
     """Train both variants side by side, with one progress bar each."""
-    running: dict[str, subprocess.Popen[bytes]] = {}
-    for name in VARIANTS:
+    running: dict[str, Watched] = {}
+    total = config.offline_updates + config.steps
+    for name, variant in VARIANTS.items():
         run = config.output_dir / name
         if _finished(run):
             continue
@@ -70,31 +68,11 @@ def train(stages: Stages, config: DemoConfig, data: dict[str, Path]) -> None:
                 f"--eval.freq={config.eval_freq}", f"--eval.n_episodes={config.eval_episodes}",
                 f"--eval.final_n_episodes={config.final_episodes}", "--save_freq=1000", "--threads=1",
             ]  # fmt: skip
-        running[name] = stages.start(name, "cqn_train.cli", *arguments)
-    total = config.offline_updates + config.steps
-    columns = (TextColumn("  {task.description:<26}"), BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("eta"),
-               TimeRemainingColumn(), TextColumn("{task.fields[note]}"))  # fmt: skip
-    with Progress(*columns, console=stages.console) as bars:
-        tasks: dict[str, TaskID] = {
-            name: bars.add_task(f"training, {VARIANTS[name]}", total=total, note="") for name in running
-        }
-        told = time.monotonic()
-        try:
-            while any(process.poll() is None for process in running.values()):
-                for name, task in tasks.items():
-                    done, note = _progress(config.output_dir / name, config)
-                    bars.update(task, completed=done, note=note)
-                    if not stages.console.is_terminal and time.monotonic() - told > LOG_EVERY_S:
-                        stages.console.print(f"  training, {VARIANTS[name]:<16} {done}/{total}  {note}")
-                if time.monotonic() - told > LOG_EVERY_S:
-                    told = time.monotonic()
-                time.sleep(1.0)
-        except KeyboardInterrupt:
-            for process in running.values():  # they have received the signal too, and are saving
-                process.wait()
-            raise
-    for name, process in running.items():
-        stages.check(name, process.returncode)
+        running[name] = Watched(
+            process=stages.start(name, "cqn_train.cli", *arguments), text=f"training, {variant}", total=total,
+            progress=partial(_progress, run, config),
+        )  # fmt: skip
+    stages.watch(running)
 
 
 def _finished(run: Path) -> bool:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -18,7 +19,7 @@ from rich.progress import (
 
 from ..interfaces import Monitor
 
-__all__ = ["ConsoleMonitor", "Monitors"]
+__all__ = ["ConsoleMonitor", "Monitors", "last_line"]
 
 LOG_EVERY_S = 15.0
 
@@ -77,6 +78,12 @@ class ConsoleMonitor:
     def message(self, text: str) -> None:
         """A line that stays."""
         self.console.print(text)
+
+
+def last_line(log: Path, begin: str = "") -> str:
+    """The last line of a command's log that is not blank and begins so; "" where there is none."""
+    lines = log.read_text(errors="replace").splitlines() if log.is_file() else []
+    return next((line.strip() for line in reversed(lines) if line.strip() and line.strip().startswith(begin)), "")
 
 
 class Monitors:
