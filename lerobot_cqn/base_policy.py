@@ -11,6 +11,7 @@ from huggingface_hub import ModelCard, constants
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
+from . import processors  # noqa: F401  # registers the steps that checkpoints name
 from .base_config import RLConfig
 from .errors import ConfigError, DataError
 from .hub_errors import HubError, cause, passing, refuse_to_start, said
