@@ -1,7 +1,6 @@
 """RLPolicy: the thin surface LeRobot's commands talk to, whatever the method."""
 
 import logging
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -14,7 +13,7 @@ from torch import Tensor
 from . import processors  # noqa: F401  # registers the steps that checkpoints name
 from .base_config import RLConfig
 from .errors import ConfigError, DataError
-from .hub_errors import HubError, cause, passing, refuse_to_start, said
+from .hub import HubError, refuse_to_start, retried, said
 from .model import Model
 from .model_card import ModelFacts, as_readme, commands, data_facts
 from .schema import ACTION, NEXT_REWARD, Batch, Observation
@@ -238,17 +237,12 @@ class RLPolicy(PreTrainedPolicy):
 
         Raises HubError, which names the command that pushes later: the run is on disk.
         """
-        for wait in (*PUSH_WAITS, None):
-            try:
-                super().push_model_to_hub(cfg, *args, **kwargs)
-                return
-            except Exception as error:  # the Hub's client and its transport raise kinds of their own
-                reason = passing(cause(error))
-                if reason is None or wait is None:
-                    raise HubError(
-                        f"{self.config.repo_id} could not be pushed ({said(cause(error))}). The run is safe in "
-                        f"{cfg.output_dir}; push it when that is mended: cqn-push --run={cfg.output_dir} "
-                        f"--repo_id={self.config.repo_id}"
-                    ) from error
-                logger.warning("%s; trying again in %g s.", reason, wait)
-                time.sleep(wait)
+
+        def explained(error: BaseException) -> HubError:
+            return HubError(
+                f"{self.config.repo_id} could not be pushed ({said(error)}). The run is safe in {cfg.output_dir}; push "
+                f"it when that is mended: cqn-push --run={cfg.output_dir} --repo_id={self.config.repo_id}"
+            )
+
+        push = super().push_model_to_hub
+        retried(lambda: push(cfg, *args, **kwargs), PUSH_WAITS, explained, logger.warning)

@@ -26,7 +26,7 @@ from huggingface_hub.utils import build_hf_headers, hf_raise_for_status  # type:
 from rich.console import Console
 
 from lerobot_cqn.errors import CQNError, DataError
-from lerobot_cqn.hub_errors import PASSING, HubError, cause, passing, said, transport
+from lerobot_cqn.hub import PASSING, HubError, cause, passing, retried, said, transport
 
 from ..terminal.console import Interrupted, note, progress
 from .files import Content, Hashes, batches, size_of
@@ -41,8 +41,6 @@ MANAGED = {
 WAITS = (1.0, 2.0, 4.0, 8.0)  # seconds before each further try
 REPORT_EVERY = 60.0  # seconds between remarks where no bar can be drawn
 TIMEOUT = httpx.Timeout(120, connect=20)  # seconds without any byte; the library's own is for ever
-
-_wait = time.sleep
 
 
 @dataclass
@@ -297,20 +295,12 @@ class Hub:
 
     def _ask(self, call: Callable[[], Any], waits: Sequence[float] = WAITS) -> Any:
         """Call, again after a while where that may help; raises HubError."""
-        for wait in (*waits, None):
+
+        def patiently() -> Any:
             get_session().timeout = TIMEOUT
-            try:
-                return call()
-            except (CQNError, KeyboardInterrupt):
-                raise
-            except Exception as error:  # the Hub's client, its transport and its encoder raise kinds of their own
-                behind = cause(error)
-                reason = passing(behind)
-                if reason is None or wait is None:
-                    raise self._explained(behind) from error
-                note(f"{reason}; trying again in {wait:g} s.")
-                _wait(wait)
-        raise AssertionError
+            return call()
+
+        return retried(patiently, waits, self._explained, note)
 
     def _explained(self, error: BaseException) -> CQNError:
         if isinstance(error, OSError) and error.filename and not isinstance(error, ConnectionError):

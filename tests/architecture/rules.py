@@ -20,9 +20,7 @@ INSTALLED_AS = {
 ROOM_MAY_USE: dict[str, tuple[str, ...]] = {
     "lerobot_cqn": (),
     "lerobot_cqn._plugin": ("train.envs", "train.sim_arm"),
-    "datasets_tools": tuple(
-        f"lerobot_cqn.{name}" for name in ["errors", "schema", "delta_actions", "hub_errors", "story"]
-    ),
+    "datasets_tools": tuple(f"lerobot_cqn.{name}" for name in ["errors", "schema", "delta_actions", "hub", "story"]),
     "train": ("lerobot_cqn", "datasets_tools"),
 }
 
@@ -33,7 +31,7 @@ FLOORS: dict[str, str] = {
     # tensors in, tensors out, never a configuration (up to losses); then networks; then what LeRobot sees
     "lerobot_cqn": (
         "errors schema|ranges intervals|distributional|augmentation losses settings networks model "
-        "critic|actor_critic|learner delta_actions joint_goals|fit_pictures|story|hub_errors base_config "
+        "critic|actor_critic|learner delta_actions joint_goals|fit_pictures|story|hub base_config "
         "model_card|processors base_policy configuration_cqn|configuration_drqv2 processor_cqn|processor_drqv2 "
         "modeling_cqn|modeling_drqv2"
     ),

@@ -13,7 +13,6 @@ import yaml
 from huggingface_hub import HfApi, close_session
 
 from cqn_data.cli import main
-from cqn_data.hub import client as hub_module
 from cqn_data.hub.card import TOOL
 from cqn_data.hub.readme import end_mark, start_mark
 
@@ -55,7 +54,7 @@ def hub(monkeypatch):
     with HubServer() as server:
         server.connect(monkeypatch)
         server.waits = []
-        monkeypatch.setattr(hub_module, "_wait", server.waits.append)
+        monkeypatch.setattr("lerobot_cqn.hub.pause", server.waits.append)
         monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda seconds: None)
         yield server
         close_session()

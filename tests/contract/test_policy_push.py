@@ -13,7 +13,6 @@ import pytest
 import yaml
 from huggingface_hub import close_session
 
-from cqn_data.hub import client as hub_module
 from cqn_train.cli import main as cqn_train
 from cqn_train.push.cli import main
 
@@ -34,8 +33,8 @@ def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[HubServer]:
     """The Hub, for this process; nobody waits between tries."""
     with HubServer() as server:
         server.connect(monkeypatch)
-        monkeypatch.setattr(hub_module, "_wait", lambda seconds: None)
-        monkeypatch.setattr("lerobot_cqn.base_policy.time.sleep", lambda seconds: None)
+        monkeypatch.setattr("lerobot_cqn.hub.pause", lambda seconds: None)
+        monkeypatch.setattr("lerobot_cqn.hub.pause", lambda seconds: None)
         monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda seconds: None)
         yield server
         close_session()

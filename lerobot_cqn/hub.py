@@ -1,12 +1,18 @@
 """Failures between this machine and the Hub, and whether another try may go better."""
 
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import httpx
 from huggingface_hub import constants, get_token
 from huggingface_hub.errors import HfHubHTTPError
 
 from .errors import CQNError
 
-__all__ = ["PASSING", "HubError", "cause", "passing", "refuse_to_start", "said", "transport"]
+__all__ = ["PASSING", "HubError", "cause", "passing", "refuse_to_start", "retried", "said", "transport"]
+
+pause = time.sleep
 
 PASSING = (408, 429, 500, 502, 503, 504)  # answers that may be another one later
 
@@ -30,6 +36,35 @@ def refuse_to_start() -> None:
         raise HubError(
             "Nobody is logged in to the Hub: run `hf auth login` with a token that may write, or set HF_TOKEN."
         )
+
+
+def retried(
+    call: Callable[[], Any],
+    waits: Sequence[float],
+    explained: Callable[[BaseException], CQNError],
+    say: Callable[[str], None],
+) -> Any:
+    """Result of a call to the Hub, made again where that may help.
+
+    Args:
+        call: raises whatever the Hub's client, its transport and its encoder raise.
+        waits: seconds before each further try.
+        explained: what is raised in place of the last failure, made from its cause.
+        say: tells a person of a failure that passes.
+    """
+    for wait in (*waits, None):
+        try:
+            return call()
+        except CQNError:
+            raise
+        except Exception as error:  # they raise kinds of their own
+            behind = cause(error)
+            reason = passing(behind)
+            if reason is None or wait is None:
+                raise explained(behind) from error
+            say(f"{reason}; trying again in {wait:g} s.")
+            pause(wait)
+    raise AssertionError
 
 
 def cause(error: BaseException) -> BaseException:
