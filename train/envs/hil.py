@@ -2,55 +2,24 @@
 
 import contextlib
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_cqn.errors import ConfigError, one_of
+from lerobot_cqn.errors import ConfigError
 
 from .cameras import Cameras
 from .common import RENDER_SIZE, checked_action, dict_space, make_lean
-from .env_config import check_cameras
+from .hil_config import CAMERAS, FPS, STATE_NAMES, STEP, TASKS, check_settings
+from .hil_expert import HilTeleoperator
 from .simulator import load_mujoco
 
-if TYPE_CHECKING:
-    from .hil_expert import HilTeleoperator
+__all__ = ["HilSim", "preserved_numpy_random"]
 
-__all__ = ["CAMERAS", "FPS", "STATE_SIZE", "STEP", "TASKS", "HilSim", "check_settings", "preserved_numpy_random"]
-
-FPS = 10
-STEP = 0.025  # m, what 1 in the action moves the tool's target; LeRobot's own setting
-CAMERAS = ("front", "wrist")
 _IN_MODEL = {"front": "front", "wrist": "handcam_rgb"}
 _CLOSED = 255.0  # gym_hil's gripper command
-_STATE_NAMES = (
-    *(f"joint_{i}.pos" for i in range(1, 8)),
-    *(f"joint_{i}.vel" for i in range(1, 8)),
-    *("gripper.command", "tcp.x", "tcp.y", "tcp.z"),
-)
-STATE_SIZE = len(_STATE_NAMES)
-
-
-class HilTask(NamedTuple):
-    """One task of gym_hil: its class, the sentence that instructs it, its limit in steps and its movable objects."""
-
-    simulation: str
-    description: str
-    max_episode_steps: int
-    objects: tuple[str, ...]
-
-
-TASKS = {
-    "pick_cube": HilTask("PandaPickCubeGymEnv", "Pick up the cube.", 100, ("block",)),
-    "arrange_boxes": HilTask(
-        "PandaArrangeBoxesGymEnv",
-        "Put each box on the field of its colour.",
-        500,
-        tuple(f"block{i}" for i in range(1, 6)),
-    ),
-}
 
 Observation = dict[str, Any]
 
@@ -106,13 +75,13 @@ class HilSim(gym.Env[Observation, NDArray[np.float32]]):
         self.render_mode = render_mode
         self.task = task
         self.task_description = TASKS[task].description
-        self.state_names = list(_STATE_NAMES)
+        self.state_names = list(STATE_NAMES)
         self.action_names = ["delta_x", "delta_y", "delta_z", "gripper"]
         self.environment_state_names = [f"{name}.{axis}" for name in self._objects for axis in "xyz"]
         lowest = np.array([-1.0, -1.0, -1.0, 0.0], np.float32)
         self.action_space = gym.spaces.Box(lowest, np.ones(4, np.float32), dtype=np.float32)
         states = len(self.environment_state_names) if self._with_state else 0
-        self.observation_space = dict_space(STATE_SIZE, states, self._camera_names, image_size)
+        self.observation_space = dict_space(len(STATE_NAMES), states, self._camera_names, image_size)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -148,10 +117,8 @@ class HilSim(gym.Env[Observation, NDArray[np.float32]]):
         """Release graphics contexts; calling it twice is harmless."""
         self._cameras.close()
 
-    def scripted_teleoperator(self, pause_share: float = 0.0, seed: int = 0) -> "HilTeleoperator":
-        """A scripted operator for this environment; see `hil_expert.HilTeleoperator`."""
-        from .hil_expert import HilTeleoperator
-
+    def scripted_teleoperator(self, pause_share: float = 0.0, seed: int = 0) -> HilTeleoperator:
+        """A scripted operator for this environment."""
         return HilTeleoperator(self, pause_share=pause_share, seed=seed)
 
     # -- what the scripted operator sees ----------------------------------------------------------------------
@@ -195,17 +162,6 @@ class HilSim(gym.Env[Observation, NDArray[np.float32]]):
                 name: self._cameras.picture(self._sim.data, _IN_MODEL[name], size, size) for name in self._camera_names
             }
         return observation
-
-
-def check_settings(task: str, obs_type: str, cameras: list[str] | tuple[str, ...], image_size: int) -> None:
-    """Validate what a user may set.
-
-    Raises:
-        ConfigError: an unknown task, obs_type or camera, none or a repeated camera, or a size out of range.
-    """
-    if task not in TASKS:
-        raise ConfigError(one_of("task", task, TASKS))
-    check_cameras(obs_type, cameras, CAMERAS, image_size)
 
 
 @contextlib.contextmanager

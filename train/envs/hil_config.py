@@ -1,17 +1,56 @@
 """How LeRobot finds gym_hil's simulation without its window: `--env.type=hil_sim`. Imports no simulator."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_cqn.errors import ConfigError
+from lerobot_cqn.errors import ConfigError, one_of
 
-from .env_config import SimEnvConfig, Sizes
-from .hil import CAMERAS, FPS, STATE_SIZE, TASKS, HilSim, check_settings
+from .env_config import SimEnvConfig, Sizes, check_cameras
 
-__all__ = ["HilSimEnv"]
+__all__ = ["CAMERAS", "FPS", "STATE_NAMES", "STEP", "TASKS", "HilSimEnv", "check_settings"]
+
+FPS = 10
+STEP = 0.025  # m, what 1 in the action moves the tool's target; LeRobot's own setting
+CAMERAS = ("front", "wrist")
+STATE_NAMES = (
+    *(f"joint_{i}.pos" for i in range(1, 8)),
+    *(f"joint_{i}.vel" for i in range(1, 8)),
+    *("gripper.command", "tcp.x", "tcp.y", "tcp.z"),
+)
+
+
+class HilTask(NamedTuple):
+    """One task of gym_hil: its class, the sentence that instructs it, its limit in steps and its movable objects."""
+
+    simulation: str
+    description: str
+    max_episode_steps: int
+    objects: tuple[str, ...]
+
+
+TASKS = {
+    "pick_cube": HilTask("PandaPickCubeGymEnv", "Pick up the cube.", 100, ("block",)),
+    "arrange_boxes": HilTask(
+        "PandaArrangeBoxesGymEnv",
+        "Put each box on the field of its colour.",
+        500,
+        tuple(f"block{i}" for i in range(1, 6)),
+    ),
+}
+
+
+def check_settings(task: str, obs_type: str, cameras: list[str] | tuple[str, ...], image_size: int) -> None:
+    """Validate what a user may set.
+
+    Raises:
+        ConfigError: an unknown task, obs_type or camera, none or a repeated camera, or a size out of range.
+    """
+    if task not in TASKS:
+        raise ConfigError(one_of("task", task, TASKS))
+    check_cameras(obs_type, cameras, CAMERAS, image_size)
 
 
 def _gym_id(task: str) -> str:
@@ -22,7 +61,7 @@ for _name, _task in TASKS.items():
     if _gym_id(_name) not in gym.registry:
         gym.register(
             _gym_id(_name),
-            entry_point=f"{HilSim.__module__}:{HilSim.__qualname__}",
+            entry_point=f"{__package__}.hil:HilSim",
             kwargs={"task": _name},
             max_episode_steps=_task.max_episode_steps,
         )
@@ -61,7 +100,7 @@ class HilSimEnv(SimEnvConfig):
     @property
     def sizes(self) -> Sizes:
         """Movement and gripper; gym_hil's state of the arm; a position an object."""
-        return Sizes(4, STATE_SIZE, 0 if self.obs_type == "pixels" else 3 * len(TASKS[str(self.task)].objects))
+        return Sizes(4, len(STATE_NAMES), 0 if self.obs_type == "pixels" else 3 * len(TASKS[str(self.task)].objects))
 
     @property
     def gym_id(self) -> str:

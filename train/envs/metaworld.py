@@ -12,6 +12,7 @@ from lerobot_cqn.errors import ConfigError
 from .cameras import Cameras
 from .common import RENDER_SIZE, checked_action, dict_space, make_lean
 from .metaworld_config import DEFAULT_CAMERAS, SIMULATOR_HZ, TASKS, canonical_task, check_settings, state_size
+from .pauses import Pauses
 from .simulator import load_mujoco
 
 __all__ = ["MetaworldSparse", "ScriptedTeleoperator"]
@@ -20,8 +21,6 @@ NAMES = ("hand_x", "hand_y", "hand_z", "gripper")
 _HAND = 4  # leading numbers of Meta-World's own observation: hand and gripper
 _FRAME = 18  # numbers of one of its two frames; behind the hand two poses, padded with zeros
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
-_PAUSE_STEPS = (3, 15)  # shortest and longest hesitation, control steps
-_MEAN_PAUSE = sum(_PAUSE_STEPS) / 2
 _UPSIDE_DOWN = ("corner", "corner2", "corner3")
 _USUAL_GAIN = 25.0  # of the experts, per m: what they multiply the way that is left with
 _METRES = 0.01  # displacement in a simulator step by an action of 1
@@ -205,31 +204,22 @@ class ScriptedTeleoperator:
         Raises:
             ConfigError: a share out of range.
         """
-        if not 0.0 <= pause_share <= 0.9:
-            raise ConfigError(f"pause_share is {pause_share}: expected 0 to 0.9.")
         self._env = env
         self._damping = _damping(env.repeat)
-        self._hazard = min(1.0, pause_share / (1.0 - pause_share) / _MEAN_PAUSE)
+        self._pauses = Pauses(pause_share)
         self.reset(seed)
 
     def reset(self, seed: int) -> None:
         """Begin an episode; call it after the environment's reset. The same seed gives the same pauses."""
-        self._rng = np.random.default_rng(seed)
+        self._pauses.reset(np.random.default_rng(seed))
         self._expert = self._env.make_expert()
         self._gripper = -1.0
-        self._left = 0
-        self._moved = True
         self.pausing = False
 
     def act(self) -> NDArray[np.float32]:
         """Action for the present state, (4,) float32 in [-1, 1]."""
-        # A step between two pauses, or the shares would not add up.
-        if self._left == 0 and self._moved and self._rng.random() < self._hazard:
-            self._left = int(self._rng.integers(_PAUSE_STEPS[0], _PAUSE_STEPS[1] + 1))
-        self.pausing = self._left > 0
-        self._moved = not self.pausing
+        self.pausing = self._pauses.next()
         if self.pausing:
-            self._left -= 1
             return np.array([0.0, 0.0, 0.0, self._gripper], np.float32)
         with warnings.catch_warnings():
             # It warns whenever a displacement is clipped, which is how it moves fast.

@@ -100,7 +100,7 @@ class SimLeader(Teleoperator):
 
     def _meet(self) -> World:
         world = self._world = find_world(self.config.world)
-        self._person = ScriptedTeleoperator(world, self.config.pause_share, seed=self.config.seed)  # type: ignore[arg-type]
+        self._person = ScriptedTeleoperator(world, self.config.pause_share, seed=self.config.seed)
         self._joints, self._closure = world.arm.joints, world.arm.closure
         self._moved = self._since = world.now
         self._scene = world.scenes

@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +13,7 @@ from lerobot_cqn.errors import ConfigError, one_of
 
 from ..envs.cameras import Cameras
 from ..envs.ur5e_station.station import LEASH, MAX_JOINT_SPEED
+from ..envs.ur5e_station.task import Task
 from ..envs.ur5e_station.tasks import TASKS
 from ..envs.ur5e_station.ur5e import HOME, TIMESTEP, Arm
 
@@ -73,11 +73,9 @@ class World:
         self._closure, self._since = self.task.start_closure, 0.0
         self.lay_out()
 
-    # What `envs.expert.ScriptedTeleoperator` steers by; it was written for the environment.
-
     @property
-    def station_task(self) -> Any:
-        """The running task."""
+    def station_task(self) -> Task:
+        """The running task, as `ScriptedTeleoperator` asks for it."""
         return self.task
 
     @property

@@ -1,6 +1,6 @@
 """The gym environment all tasks of the station share."""
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -11,11 +11,10 @@ from lerobot_cqn.errors import ConfigError, one_of
 from ..cameras import Cameras
 from ..common import RENDER_SIZE, checked_action
 from ..env_config import check_cameras
+from .expert import ScriptedTeleoperator
+from .task import Task
 from .tasks import TASKS
 from .ur5e import HOME, STATE_NAMES, TIMESTEP, Arm
-
-if TYPE_CHECKING:
-    from .expert import ScriptedTeleoperator
 
 __all__ = ["CAMERAS", "LEASH", "MAX_JOINT_SPEED", "UR5eStation"]
 
@@ -130,10 +129,8 @@ class UR5eStation(gym.Env[Observation, NDArray[np.float32]]):
 
     def scripted_teleoperator(
         self, pause_share: float = 0.0, seed: int = 0, tremor_rad: float = 0.0
-    ) -> "ScriptedTeleoperator":
-        """A scripted operator for this environment; see `expert.ScriptedTeleoperator`."""
-        from .expert import ScriptedTeleoperator
-
+    ) -> ScriptedTeleoperator:
+        """A scripted operator for this environment."""
         return ScriptedTeleoperator(self, pause_share=pause_share, tremor_rad=tremor_rad, seed=seed)
 
     @property
@@ -142,8 +139,8 @@ class UR5eStation(gym.Env[Observation, NDArray[np.float32]]):
         return self._arm
 
     @property
-    def station_task(self) -> Any:
-        """The running task (`task.Task`)."""
+    def station_task(self) -> Task:
+        """The running task."""
         return self._task
 
     def _observe(self) -> Observation:
