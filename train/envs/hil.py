@@ -1,30 +1,24 @@
 """gym_hil's simulated Franka arm, seeded and without its expensive renderer."""
 
-import contextlib
-from collections.abc import Iterator
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_cqn.errors import ConfigError
-
-from .cameras import Cameras
-from .common import RENDER_SIZE, checked_action, dict_space, make_lean
-from .hil_config import CAMERAS, FPS, STATE_NAMES, STEP, TASKS, check_settings
+from .cameras import RENDER_SIZE, make_lean
+from .hil_config import STATE_NAMES, STEP, TASKS, HilSimEnv
 from .hil_expert import HilTeleoperator
-from .simulator import load_mujoco
+from .sim_env import MujocoEnv, Observation, preserved_numpy_random
+from .simulator import load_mujoco, needed
 
-__all__ = ["HilSim", "preserved_numpy_random"]
+__all__ = ["HilSim"]
 
-_IN_MODEL = {"front": "front", "wrist": "handcam_rgb"}
+_IN_MODEL = {"wrist": "handcam_rgb"}  # our name of a camera, and gym_hil's
 _CLOSED = 255.0  # gym_hil's gripper command
 
-Observation = dict[str, Any]
 
-
-class HilSim(gym.Env[Observation, NDArray[np.float32]]):
+class HilSim(MujocoEnv):
     """gym_hil's Franka Panda with a gripper over a floor, in MuJoCo at 10 Hz; sparse reward.
 
     Its physics, controller, start and success are gym_hil's own; only seeding, pictures and the gripper's convention
@@ -47,54 +41,31 @@ class HilSim(gym.Env[Observation, NDArray[np.float32]]):
         state_names, action_names, environment_state_names: of the numbers above.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": FPS}
-
-    def __init__(
-        self,
-        task: str = "pick_cube",
-        obs_type: str = "state",
-        cameras: list[str] | tuple[str, ...] = CAMERAS,
-        image_size: int = 84,
-        random_position: bool = True,
-        render_mode: str | None = "rgb_array",
-    ) -> None:
-        """Build the scene; no graphics context is opened before the first picture.
+    def __init__(self, **settings: Any) -> None:
+        """Build the scene from fields of `HilSimEnv`.
 
         Raises:
-            ConfigError: an unknown task, obs_type or camera; a size out of range; gym_hil is missing.
+            ConfigError: a setting that `HilSimEnv` refuses, or gym_hil is missing.
         """
-        check_settings(task, obs_type, cameras, image_size)
-        self._objects = TASKS[task].objects
-        self._sim = _simulation(task, random_position)
-        make_lean(self._sim.model, image_size)
-        self._cameras = Cameras(self._sim.model)
-        self._camera_names = tuple(cameras) if obs_type != "state" else ()
-        self._with_state = obs_type != "pixels"
-        self._image_size = image_size
-        self.fps = FPS
-        self.render_mode = render_mode
-        self.task = task
-        self.task_description = TASKS[task].description
+        config = HilSimEnv(**settings)
+        task = TASKS[str(config.task)]
+        self._sim = _simulation(task.simulation, config)
+        make_lean(self._sim.model, config.image_size)
+        super().__init__(config, self._sim.model)
+        self._objects = task.objects
+        self.task_description = task.description
         self.state_names = list(STATE_NAMES)
         self.action_names = ["delta_x", "delta_y", "delta_z", "gripper"]
         self.environment_state_names = [f"{name}.{axis}" for name in self._objects for axis in "xyz"]
         lowest = np.array([-1.0, -1.0, -1.0, 0.0], np.float32)
         self.action_space = gym.spaces.Box(lowest, np.ones(4, np.float32), dtype=np.float32)
-        states = len(self.environment_state_names) if self._with_state else 0
-        self.observation_space = dict_space(len(STATE_NAMES), states, self._camera_names, image_size)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; the same `seed` gives the same episode, without one the random stream goes on.
-
-        `options` is accepted for callers that pass marks of their own; none changes anything.
-        """
-        super().reset(seed=seed)
+    def _begin(self, seed: int | None) -> Observation:
+        """Lay the scene out; an episode follows from its seed alone."""
         # gym_hil ignores a seed and draws from numpy's global state.
         with preserved_numpy_random(int(self.np_random.integers(2**32))):
             self._sim.reset()
-        return self._observe(), {"is_success": False}
+        return self._observe()
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Apply one action for 0.1 s.
@@ -102,7 +73,7 @@ class HilSim(gym.Env[Observation, NDArray[np.float32]]):
         Raises:
             DataError: the action is not four finite numbers.
         """
-        checked = checked_action(action, self.action_space, self.action_names)
+        checked = self._checked(action)
         # gym_hil's own action is a change of the gripper's closure.
         native = np.concatenate([checked[:3] * STEP, np.zeros(3), [checked[3] - self.closure]])
         _, reward, terminated, _, _ = self._sim.step(native)
@@ -112,10 +83,6 @@ class HilSim(gym.Env[Observation, NDArray[np.float32]]):
     def render(self) -> NDArray[np.uint8]:
         """The front camera, (360, 480, 3) uint8 RGB."""
         return self._cameras.picture(self._sim.data, "front", *RENDER_SIZE)
-
-    def close(self) -> None:
-        """Release graphics contexts; calling it twice is harmless."""
-        self._cameras.close()
 
     def scripted_teleoperator(self, pause_share: float = 0.0, seed: int = 0) -> HilTeleoperator:
         """A scripted operator for this environment."""
@@ -157,22 +124,8 @@ class HilSim(gym.Env[Observation, NDArray[np.float32]]):
             places = np.concatenate([self.place(name) for name in self._objects])
             observation["environment_state"] = places.astype(np.float32)
         if self._camera_names:
-            size = self._image_size
-            observation["pixels"] = {
-                name: self._cameras.picture(self._sim.data, _IN_MODEL[name], size, size) for name in self._camera_names
-            }
+            observation["pixels"] = self._pictures(self._sim.data, _IN_MODEL)
         return observation
-
-
-@contextlib.contextmanager
-def preserved_numpy_random(seed: int) -> Iterator[None]:
-    """Seed numpy's global random state inside, and put the caller's back afterwards."""
-    before = np.random.get_state()
-    np.random.seed(seed)
-    try:
-        yield
-    finally:
-        np.random.set_state(before)
 
 
 class _NoRenderer:
@@ -183,18 +136,14 @@ class _NoRenderer:
     def render(self) -> None: ...
 
 
-def _simulation(task: str, random_position: bool) -> Any:
-    try:
+def _simulation(name: str, config: HilSimEnv) -> Any:
+    """gym_hil's environment. Raises ConfigError where it is not installed."""
+    with needed("The environment 'hil_sim' needs gym_hil", "hil"):
         mujoco = load_mujoco()
         from gym_hil import envs
-    except (ImportError, ConfigError) as error:
-        raise ConfigError(
-            "The environment 'hil_sim' needs gym_hil, which is not installed: "
-            "run `pip install 'lerobot_policy_cqn[hil]'`."
-        ) from error
-    chosen = {"random_block_position": random_position} if task == "pick_cube" else {}
+    chosen = {"random_block_position": config.random_position} if config.task == "pick_cube" else {}
     renderer, mujoco.Renderer = mujoco.Renderer, _NoRenderer
     try:
-        return getattr(envs, TASKS[task].simulation)(**chosen)
+        return getattr(envs, name)(**chosen)
     finally:
         mujoco.Renderer = renderer

@@ -1,20 +1,19 @@
-"""How LeRobot finds gym_hil's simulation without its window: `--env.type=hil_sim`. Imports no simulator."""
+"""Settings of gym_hil's simulation, `--env.type=hil_sim`. No simulator is imported here."""
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import gymnasium as gym
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_cqn.errors import ConfigError, one_of
+from lerobot_cqn.errors import ConfigError
 
-from .env_config import SimEnvConfig, Sizes, check_cameras
+from .env_config import SimEnvConfig, Sizes, register
 
-__all__ = ["CAMERAS", "FPS", "STATE_NAMES", "STEP", "TASKS", "HilSimEnv", "check_settings"]
+__all__ = ["STATE_NAMES", "STEP", "TASKS", "HilSimEnv"]
 
-FPS = 10
+_FPS = 10
 STEP = 0.025  # m, what 1 in the action moves the tool's target; LeRobot's own setting
-CAMERAS = ("front", "wrist")
+_CAMERAS = ("front", "wrist")
 STATE_NAMES = (
     *(f"joint_{i}.pos" for i in range(1, 8)),
     *(f"joint_{i}.vel" for i in range(1, 8)),
@@ -42,31 +41,6 @@ TASKS = {
 }
 
 
-def check_settings(task: str, obs_type: str, cameras: list[str] | tuple[str, ...], image_size: int) -> None:
-    """Validate what a user may set.
-
-    Raises:
-        ConfigError: an unknown task, obs_type or camera, none or a repeated camera, or a size out of range.
-    """
-    if task not in TASKS:
-        raise ConfigError(one_of("task", task, TASKS))
-    check_cameras(obs_type, cameras, CAMERAS, image_size)
-
-
-def _gym_id(task: str) -> str:
-    return f"cqn_hil/{task}-v0"
-
-
-for _name, _task in TASKS.items():
-    if _gym_id(_name) not in gym.registry:
-        gym.register(
-            _gym_id(_name),
-            entry_point=f"{__package__}.hil:HilSim",
-            kwargs={"task": _name},
-            max_episode_steps=_task.max_episode_steps,
-        )
-
-
 @EnvConfig.register_subclass("hil_sim")
 @dataclass
 class HilSimEnv(SimEnvConfig):
@@ -86,16 +60,20 @@ class HilSimEnv(SimEnvConfig):
         ConfigError: a value that is not one of those named above, or a given feature of another shape.
     """
 
+    gym_name = "cqn_hil/{task}-v0"
+    tasks = TASKS
+    known_cameras = _CAMERAS
+
     task: str | None = "pick_cube"  # pick_cube or arrange_boxes
-    fps: int = FPS  # gym_hil's
+    fps: int = _FPS  # gym_hil's
     random_position: bool = True  # objects placed anew in each episode
-    cameras: list[str] = field(default_factory=lambda: list(CAMERAS))  # front, wrist
+    cameras: list[str] = field(default_factory=lambda: list(_CAMERAS))  # front, wrist
 
     def check(self) -> None:
         """Validate what a user may set. Raises ConfigError."""
-        check_settings(self.task or "", self.obs_type, self.cameras, self.image_size)
-        if self.fps != FPS:
-            raise ConfigError(f"fps is {self.fps}: expected {FPS}, the rate of gym_hil's controller.")
+        super().check()
+        if self.fps != _FPS:
+            raise ConfigError(f"fps is {self.fps}: expected {_FPS}, the rate of gym_hil's controller.")
 
     @property
     def sizes(self) -> Sizes:
@@ -103,16 +81,8 @@ class HilSimEnv(SimEnvConfig):
         return Sizes(4, len(STATE_NAMES), 0 if self.obs_type == "pixels" else 3 * len(TASKS[str(self.task)].objects))
 
     @property
-    def gym_id(self) -> str:
-        """Name of the environment in gymnasium's registry."""
-        return _gym_id(str(self.task))
-
-    @property
     def usual_steps(self) -> int:
-        """Control steps before an episode of the task is cut off, where the user does not say."""
         return TASKS[str(self.task)].max_episode_steps
 
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `gymnasium.make`."""
-        return {**super().gym_kwargs, "random_position": self.random_position}
+
+register(HilSimEnv, "hil:HilSim")
