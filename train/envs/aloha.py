@@ -92,7 +92,7 @@ class Aloha(MujocoEnv):
         return self._cameras.picture(self._data, "top", *RENDER_SIZE)
 
     def _numbers(self, physics: Any) -> dict[str, Any]:
-        """What gym_aloha reads from its task after a step, without its pictures."""
+        """Numbers that gym_aloha reads from its task after a step, without its pictures."""
         return {
             "qpos": self._native_task.get_qpos(physics),
             "env_state": self._native_task.get_env_state(physics),
@@ -109,7 +109,7 @@ class Aloha(MujocoEnv):
         return observation
 
     def _picture(self, camera: str) -> NDArray[np.uint8]:
-        """What `cqn-data resize` makes of the public datasets' 480x640: the same view, squeezed."""
+        """Picture that `cqn-data resize` makes of the public datasets' 480x640: the same view, squeezed."""
         size = self._image_size
         wide = self._cameras.picture(self._data, camera, *_picture_size(size))
         return np.asarray(Image.fromarray(wide).resize((size, size), Image.Resampling.BOX))

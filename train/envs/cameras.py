@@ -29,7 +29,7 @@ def make_lean(model: Any, image_size: int) -> None:
 
 
 class Cameras:
-    """Renders named cameras of one model; no graphics context is opened before the first picture."""
+    """Pictures by named cameras of one model; no graphics context is opened before the first picture."""
 
     def __init__(self, model: Any) -> None:
         self._model = model

@@ -33,6 +33,7 @@ class ControlSuite(MujocoEnv):
     Attributes:
         task, task_description: domain and task as dm_control names them, and the same in words.
         state_names, action_names: of `agent_pos` and the action.
+        suite: dm_control's environment (`control.Environment`).
     """
 
     def __init__(self, **settings: Any) -> None:
@@ -43,8 +44,8 @@ class ControlSuite(MujocoEnv):
         """
         config = DMCEnv(**settings)
         domain, name = str(config.task).split("-", 1)
-        self._suite = _load(domain, name)
-        model = self._suite.physics.model.ptr
+        self.suite = _load(domain, name)
+        model = self.suite.physics.model.ptr
         make_lean(model, config.image_size)
         super().__init__(config, model)
         self._camera = model.camera(_CAMERA_NUMBERS.get(self.task, _CAMERA_NUMBERS.get(domain, 0))).name
@@ -52,22 +53,20 @@ class ControlSuite(MujocoEnv):
         self._repeat = config.repeat
         self._over = True
         self.task_description = f"{domain} {name}".replace("_", " ")
-        bounds = self._suite.action_spec()
+        bounds = self.suite.action_spec()
         self._low, self._high = np.asarray(bounds.minimum), np.asarray(bounds.maximum)
         self.action_names = [model.actuator(i).name or f"actuator_{i}" for i in range(model.nu)]
         self.state_names = [
-            f"{key}_{i}"
-            for key, spec in self._suite.observation_spec().items()
-            for i in range(int(np.prod(spec.shape)))
+            f"{key}_{i}" for key, spec in self.suite.observation_spec().items() for i in range(int(np.prod(spec.shape)))
         ]
         self.action_space = gym.spaces.Box(-1.0, 1.0, self._low.shape, np.float32)
 
     def _begin(self, seed: int | None) -> Observation:
         """Lay the scene out; an episode follows from its seed alone."""
         # The task draws from a generator of its own, of numpy's older kind, seeded with 32 bits.
-        self._suite.task.random.seed(int(self.np_random.integers(2**32)))
+        self.suite.task.random.seed(int(self.np_random.integers(2**32)))
         self._over = False
-        return self._observe(self._suite.reset())
+        return self._observe(self.suite.reset())
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Apply one action for `action_repeat` suite steps, or until the episode's end.
@@ -83,7 +82,7 @@ class ControlSuite(MujocoEnv):
         wanted = self._low + (checked + 1.0) / 2.0 * (self._high - self._low)
         reward = 0.0
         for _ in range(self._repeat):
-            moment = self._suite.step(wanted)
+            moment = self.suite.step(wanted)
             reward += float(moment.reward or 0.0)
             if moment.last():
                 break
@@ -92,13 +91,8 @@ class ControlSuite(MujocoEnv):
         return self._observe(moment), reward, terminated, self._over and not terminated, {"is_success": False}
 
     def render(self) -> NDArray[np.uint8]:
-        """What the camera sees, (360, 480, 3) uint8 RGB."""
-        return self._cameras.picture(self._suite.physics.data.ptr, self._camera, *RENDER_SIZE)
-
-    @property
-    def suite(self) -> Any:
-        """dm_control's environment (`control.Environment`)."""
-        return self._suite
+        """View of the camera, (360, 480, 3) uint8 RGB."""
+        return self._cameras.picture(self.suite.physics.data.ptr, self._camera, *RENDER_SIZE)
 
     def _observe(self, moment: Any) -> Observation:
         observation: Observation = {}
@@ -106,7 +100,7 @@ class ControlSuite(MujocoEnv):
             parts = [np.ravel(value) for value in moment.observation.values()]
             observation["agent_pos"] = np.concatenate(parts).astype(np.float32)
         if self._camera_names:
-            observation["pixels"] = self._pictures(self._suite.physics.data.ptr, {"camera0": self._camera})
+            observation["pixels"] = self._pictures(self.suite.physics.data.ptr, {"camera0": self._camera})
         return observation
 
 

@@ -51,6 +51,8 @@ class SimEnvConfig(EnvConfig):
     gym_name: ClassVar[str]  # name in gymnasium's registry, with {task}
     tasks: ClassVar[Collection[str]]  # names of all there are
     known_cameras: ClassVar[tuple[str, ...]] = ()  # names of all there are; () where pictures have none
+    rates: ClassVar[tuple[int, ...]] = ()  # values of fps that there are; () where it follows from other fields
+    rates_are: ClassVar[str] = ""  # why there are no others
 
     obs_type: str = "state"  # state (no cameras), pixels (no simulator state) or both
     cameras: list[str] = field(default_factory=list)
@@ -87,10 +89,13 @@ class SimEnvConfig(EnvConfig):
                 raise ConfigError(f"cameras is {list(self.cameras)}: expected at least one name, each once.")
         if not 16 <= self.image_size <= 1024:
             raise ConfigError(f"image_size is {self.image_size}: expected 16 to 1024 pixels.")
+        if self.rates and self.fps not in self.rates:
+            known = " or ".join(", ".join(map(str, self.rates)).rsplit(", ", 1))
+            raise ConfigError(f"fps is {self.fps}: expected {known} ({self.rates_are}).")
 
     @property
     def sizes(self) -> Sizes:
-        """Of action, `agent_pos` and `environment_state` with the present settings."""
+        """Numbers of action, `agent_pos` and `environment_state` with the present settings."""
         raise NotImplementedError
 
     @property
@@ -123,6 +128,7 @@ class SimEnvConfig(EnvConfig):
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Arguments of `gymnasium.make`: the limit, and the fields that concern the environment."""
+        # What LeRobot's own class has is for its commands, but for fps; the length is the limit.
         elsewhere = {item.name for item in fields(EnvConfig)} - {"fps"} | {"episode_length"}
         own = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in elsewhere}
         return {**own, "max_episode_steps": self.max_episode_steps}

@@ -39,6 +39,7 @@ class HilSim(MujocoEnv):
     Attributes:
         task, task_description: name of the task, and the sentence that instructs it.
         state_names, action_names, environment_state_names: of the numbers above.
+        objects: names of the movable objects.
     """
 
     def __init__(self, **settings: Any) -> None:
@@ -52,11 +53,11 @@ class HilSim(MujocoEnv):
         self._sim = _simulation(task.simulation, config)
         make_lean(self._sim.model, config.image_size)
         super().__init__(config, self._sim.model)
-        self._objects = task.objects
+        self.objects = task.objects
         self.task_description = task.description
         self.state_names = list(STATE_NAMES)
         self.action_names = ["delta_x", "delta_y", "delta_z", "gripper"]
-        self.environment_state_names = [f"{name}.{axis}" for name in self._objects for axis in "xyz"]
+        self.environment_state_names = [f"{name}.{axis}" for name in self.objects for axis in "xyz"]
         lowest = np.array([-1.0, -1.0, -1.0, 0.0], np.float32)
         self.action_space = gym.spaces.Box(lowest, np.ones(4, np.float32), dtype=np.float32)
 
@@ -106,11 +107,6 @@ class HilSim(MujocoEnv):
         target: NDArray[np.float64] = self._sim.data.mocap_pos[0].copy()
         return target
 
-    @property
-    def objects(self) -> tuple[str, ...]:
-        """Names of the movable objects."""
-        return self._objects
-
     def place(self, name: str) -> NDArray[np.float64]:
         """Position of an object or field, (3,) m."""
         position: NDArray[np.float64] = self._sim.data.sensor(f"{name}_pos").data.copy()
@@ -121,7 +117,7 @@ class HilSim(MujocoEnv):
     def _observe(self) -> Observation:
         observation: Observation = {"agent_pos": self._sim.get_robot_state().astype(np.float32)}
         if self._with_state:
-            places = np.concatenate([self.place(name) for name in self._objects])
+            places = np.concatenate([self.place(name) for name in self.objects])
             observation["environment_state"] = places.astype(np.float32)
         if self._camera_names:
             observation["pixels"] = self._pictures(self._sim.data, _IN_MODEL)
@@ -129,7 +125,7 @@ class HilSim(MujocoEnv):
 
 
 class _NoRenderer:
-    """Stands in while gym_hil builds a scene: it would open a renderer even where nobody looks."""
+    """Stand-in while gym_hil builds a scene: it would open a renderer even where nobody looks."""
 
     def __init__(self, *_: Any, **__: Any) -> None: ...
 

@@ -5,13 +5,10 @@ from typing import NamedTuple
 
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_cqn.errors import ConfigError
-
 from .env_config import SimEnvConfig, Sizes, register
 
 __all__ = ["STATE_NAMES", "STEP", "TASKS", "HilSimEnv"]
 
-_FPS = 10
 STEP = 0.025  # m, what 1 in the action moves the tool's target; LeRobot's own setting
 _CAMERAS = ("front", "wrist")
 STATE_NAMES = (
@@ -63,17 +60,13 @@ class HilSimEnv(SimEnvConfig):
     gym_name = "cqn_hil/{task}-v0"
     tasks = TASKS
     known_cameras = _CAMERAS
+    rates = (10,)
+    rates_are = "the rate of gym_hil's controller"
 
     task: str | None = "pick_cube"  # pick_cube or arrange_boxes
-    fps: int = _FPS  # gym_hil's
+    fps: int = 10  # gym_hil's
     random_position: bool = True  # objects placed anew in each episode
     cameras: list[str] = field(default_factory=lambda: list(_CAMERAS))  # front, wrist
-
-    def check(self) -> None:
-        """Validate what a user may set. Raises ConfigError."""
-        super().check()
-        if self.fps != _FPS:
-            raise ConfigError(f"fps is {self.fps}: expected {_FPS}, the rate of gym_hil's controller.")
 
     @property
     def sizes(self) -> Sizes:

@@ -1,4 +1,4 @@
-"""A scripted operator for gym_hil's tasks: steers through the same four values as any policy, and pauses."""
+"""A scripted operator for gym_hil's tasks: it steers through the same four values as any policy, and pauses."""
 
 from typing import NamedTuple, Protocol
 
@@ -27,21 +27,30 @@ class Goal(NamedTuple):
 
 
 class Tool(Protocol):
-    """Simulated gripper among objects, as the operator sees it: `hil.HilSim`."""
+    """Simulated gripper among objects, as the operator sees it.
 
-    @property
-    def objects(self) -> tuple[str, ...]: ...
+    Attributes:
+        objects: names of the movable objects.
+        closure: the gripper's command, 0 (open) to 1 (closed).
+        tip: measured position of the tool, (3,) m.
+        target: position the tool is sent to, (3,) m.
+    """
+
+    objects: tuple[str, ...]
+
     @property
     def closure(self) -> float: ...
     @property
     def tip(self) -> NDArray[np.float64]: ...
     @property
     def target(self) -> NDArray[np.float64]: ...
-    def place(self, name: str) -> NDArray[np.float64]: ...
+
+    def place(self, name: str) -> NDArray[np.float64]:
+        """Position of an object or field, (3,) m."""
 
 
 class HilTeleoperator:
-    """Goes over an object, down, grasps, lifts, and in `arrange_boxes` carries it to its field.
+    """Operator that goes over an object, down, grasps, lifts, and in `arrange_boxes` carries it to its field.
 
     While moving, the action depends on the present state alone. While pausing it is a zero movement with the gripper
     as it was. Pauses come at the start, before grasping and at random.

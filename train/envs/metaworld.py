@@ -45,6 +45,9 @@ class MetaworldSparse(MujocoEnv):
         task, task_description: Meta-World's name of the task, and the sentence that instructs it.
         state_names, action_names: of `agent_pos` and the action.
         environment_state_names: of objects and goal.
+        simulator: Meta-World's environment (`SawyerXYZEnv`).
+        raw_observation: (39,) Meta-World's own observation: present and former frame of 18 numbers, and the goal.
+        repeat: simulator steps for which an action is held.
         action_kind: "command": each action stands for itself, so that leaving steps out changes no other.
     """
 
@@ -58,16 +61,16 @@ class MetaworldSparse(MujocoEnv):
         """
         config = MetaworldSparseEnv(**settings)
         self._mujoco, make, self._expert = _load(str(config.task))
-        self._simulator = make()
-        self._simulator.seeded_rand_vec = True
-        self._simulator._set_task_called = True
+        self.simulator = make()
+        self.simulator.seeded_rand_vec = True
+        self.simulator._set_task_called = True
         # Longer episodes are the time limit's affair; Meta-World would raise.
-        self._simulator.max_path_length = 10**9
-        make_lean(self._simulator.model, config.image_size)
-        _place_cameras(self._simulator.model)
-        super().__init__(config, self._simulator.model)
-        self._repeat = SIMULATOR_HZ // config.fps
-        self._raw: NDArray[np.float64] = np.zeros(2 * _FRAME + 3)
+        self.simulator.max_path_length = 10**9
+        make_lean(self.simulator.model, config.image_size)
+        _place_cameras(self.simulator.model)
+        super().__init__(config, self.simulator.model)
+        self.repeat = SIMULATOR_HZ // config.fps
+        self.raw_observation: NDArray[np.float64] = np.zeros(2 * _FRAME + 3)
         self.task_description = TASKS[self.task.removesuffix("-v3")]
         self.state_names = list(NAMES)
         self.action_names = list(NAMES)
@@ -78,7 +81,7 @@ class MetaworldSparse(MujocoEnv):
 
     def _begin(self, seed: int | None) -> Observation:
         """Lay the scene out; an episode follows from its seed alone."""
-        simulator = self._simulator
+        simulator = self.simulator
         if seed is not None:
             simulator.seed(seed)
         # Meta-World's reset lays the scene out twice and measures the goal in between: places drawn anew for the
@@ -91,7 +94,7 @@ class MetaworldSparse(MujocoEnv):
         # It moves objects last and looks at them without this.
         self._mujoco.mj_forward(simulator.model, simulator.data)
         frame = simulator._get_curr_obs_combined_no_goal()
-        self._raw = np.concatenate([frame, frame, simulator._get_pos_goal()])
+        self.raw_observation = np.concatenate([frame, frame, simulator._get_pos_goal()])
         return self._observe()
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -102,49 +105,34 @@ class MetaworldSparse(MujocoEnv):
         """
         checked = self._checked(action)
         success = False
-        for _ in range(self._repeat):
-            raw, _, _, _, info = self._simulator.step(checked)
+        for _ in range(self.repeat):
+            raw, _, _, _, info = self.simulator.step(checked)
             success = bool(info["success"])
             if success:
                 break
-        self._raw = np.concatenate([raw[: 2 * _FRAME], self._simulator._get_pos_goal()])
+        self.raw_observation = np.concatenate([raw[: 2 * _FRAME], self.simulator._get_pos_goal()])
         return self._observe(), float(success), success, False, {"is_success": success}
 
     def render(self) -> NDArray[np.uint8]:
         """The table from the corner, (360, 480, 3) uint8 RGB."""
-        return self._cameras.picture(self._simulator.data, "corner2", *RENDER_SIZE)
+        return self._cameras.picture(self.simulator.data, "corner2", *RENDER_SIZE)
 
     def scripted_teleoperator(self, pause_share: float = 0.0, seed: int = 0) -> "ScriptedTeleoperator":
         """Meta-World's own expert for the task; see `ScriptedTeleoperator`."""
         return ScriptedTeleoperator(self, pause_share=pause_share, seed=seed)
-
-    @property
-    def raw_observation(self) -> NDArray[np.float64]:
-        """(39,) Meta-World's own observation: present and former frame of 18 numbers, and the goal."""
-        return self._raw
-
-    @property
-    def repeat(self) -> int:
-        """Simulator steps for which an action is held."""
-        return self._repeat
-
-    @property
-    def simulator(self) -> Any:
-        """Meta-World's environment (`SawyerXYZEnv`)."""
-        return self._simulator
 
     def make_expert(self) -> Any:
         """A new scripted policy of Meta-World's for the task, from raw observation to action."""
         return self._expert()
 
     def _observe(self) -> Observation:
-        raw = self._raw.astype(np.float32)
+        raw = self.raw_observation.astype(np.float32)
         observation: Observation = {"agent_pos": raw[:_HAND]}
         if self._with_state:
             objects = raw[_HAND : _HAND + self._poses]
             observation["environment_state"] = np.concatenate([objects, raw[-3:]])
         if self._camera_names:
-            observation["pixels"] = self._pictures(self._simulator.data)
+            observation["pixels"] = self._pictures(self.simulator.data)
         return observation
 
 

@@ -13,7 +13,7 @@ _MEAN = sum(_STEPS) / 2
 
 
 class Pauses:
-    """Draws which steps of an episode are pauses, so that about a given share of them is.
+    """Draw of the steps of an episode that are pauses, about a given share of them.
 
     A task with natural moments to pause has them first, the start of the episode included; what is then lacking begins
     at random steps. A task without has pauses at random steps only, and at least one step between two.

@@ -6,13 +6,10 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import OBS_IMAGE
 
-from lerobot_cqn.errors import ConfigError
-
 from .env_config import REWARDS, SimEnvConfig, Sizes, check_name, register
 
 __all__ = ["KEYPOINTS", "PushtSmallEnv"]
 
-_FPS = 10
 KEYPOINTS = 16  # numbers: x and y of eight corners
 _LIMIT = 300  # steps, gym_pusht's own
 
@@ -40,9 +37,11 @@ class PushtSmallEnv(SimEnvConfig):
 
     gym_name = "cqn_pusht/PushT-v0"
     tasks = ("pusht",)
+    rates = (10,)
+    rates_are = "gym_pusht's own"
 
     task: str | None = "pusht"  # the only one
-    fps: int = _FPS  # gym_pusht's
+    fps: int = 10  # gym_pusht's
     obs_type: str = "pixels"  # state, pixels or both
     image_size: int = 96  # pixels a side; 96 in the public dataset
     reward: str = "sparse"  # 1 at success, or "dense": the covered share
@@ -51,8 +50,6 @@ class PushtSmallEnv(SimEnvConfig):
         """Validate what a user may set. Raises ConfigError."""
         super().check()
         check_name("reward", self.reward, REWARDS)
-        if self.fps != _FPS:
-            raise ConfigError(f"fps is {self.fps}: expected {_FPS}, gym_pusht's own.")
 
     @property
     def sizes(self) -> Sizes:

@@ -26,7 +26,7 @@ _NAMES = [*(f"joint_positions.{i}" for i in range(_JOINTS)), "gripper_open"]
 
 
 class _Modules(NamedTuple):
-    """What is used of RLBench."""
+    """Parts of RLBench that are used."""
 
     tasks: Any
     environment: Any
@@ -126,7 +126,7 @@ class RLBenchGym(SimEnv):
         return self._last, float(success), bool(terminated) or success, False, {"is_success": success}
 
     def render(self) -> NDArray[np.uint8]:
-        """What the first camera saw last, (image_size, image_size, 3) uint8 RGB.
+        """Picture that the first camera saw last, (image_size, image_size, 3) uint8 RGB.
 
         Raises:
             DataError: no episode has begun.

@@ -10,7 +10,6 @@ from .env_config import SimEnvConfig, Sizes, register
 
 __all__ = ["CAMERAS", "TASKS", "RLBenchEnv"]
 
-_FPS = 20  # one step of the simulator is 0.05 s
 CAMERAS = ("front", "wrist", "left_shoulder", "right_shoulder")
 
 # The paper's 20 tasks and its limits in steps.
@@ -62,9 +61,11 @@ class RLBenchEnv(SimEnvConfig):
     gym_name = "cqn_rlbench/{task}-v0"
     tasks = TASKS
     known_cameras = CAMERAS
+    rates = (20,)
+    rates_are = "a step of RLBench's simulation is 0.05 s"
 
     task: str | None = "take_lid_off_saucepan"  # one of the paper's 20
-    fps: int = _FPS  # RLBench's
+    fps: int = 20  # RLBench's
     variation: int = 0  # of the task
     obs_type: str = "pixels"  # the only one
     cameras: list[str] = field(default_factory=lambda: list(CAMERAS))  # front, wrist, shoulders
@@ -78,8 +79,6 @@ class RLBenchEnv(SimEnvConfig):
         super().check()
         if self.variation < 0:
             raise ConfigError(f"variation is {self.variation}: expected 0 or more.")
-        if self.fps != _FPS:
-            raise ConfigError(f"fps is {self.fps}: expected {_FPS}, a step of RLBench's simulation is 0.05 s.")
 
     @property
     def sizes(self) -> Sizes:

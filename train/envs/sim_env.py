@@ -21,7 +21,8 @@ Observation = dict[str, Any]
 class SimEnv(gym.Env[Observation, NDArray[np.float32]]):
     """An environment that takes its settings, its observations' space and its rate from a configuration.
 
-    A subclass says the action space, names of all numbers, `_begin`, and gymnasium's `step`, `render` and `close`.
+    A subclass says the action space, names of all numbers, `_begin`, and gymnasium's `step`, `render` and `close`. It
+    looks at `_with_state` and `_camera_names` to see what is observed beside `agent_pos`.
 
     Attributes:
         task, fps: of the configuration.
@@ -92,7 +93,7 @@ class MujocoEnv(SimEnv):
         self._cameras.close()
 
     def _pictures(self, data: Any, in_model: Mapping[str, str] | None = None) -> dict[str, NDArray[np.uint8]]:
-        """What the observed cameras see, by name; `in_model` is the model's name for a camera, where it has another."""
+        """Views of the observed cameras, by name; `in_model` has the model's name for a camera where that differs."""
         names, size = in_model or {}, self._image_size
         return {name: self._cameras.picture(data, names.get(name, name), size, size) for name in self._camera_names}
 

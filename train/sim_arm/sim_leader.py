@@ -128,7 +128,7 @@ class SimLeader(Teleoperator):
             largest = float(np.abs(way).max())
             limit = MAX_JOINT_SPEED / world.fps
             self._joints = self._joints + way * min(1.0, limit / max(largest, 1e-9))
-            self._closure = world.task.start_closure
+            self._closure = world.station_task.start_closure
             if world.scenes != self._scene:
                 self._scene = world.scenes
                 self._enter("wait", world)

@@ -4,8 +4,6 @@ from dataclasses import dataclass, field
 
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_cqn.errors import ConfigError
-
 from ..env_config import SimEnvConfig, Sizes, register
 from .tasks import TASKS
 
@@ -36,16 +34,12 @@ class UR5eStationEnv(SimEnvConfig):
     gym_name = "cqn_station/{task}-v0"
     tasks = TASKS
     known_cameras = CAMERAS
+    rates = (5, 10, 20, 25, 50)
+    rates_are = "whole physics steps of 4 ms"
 
     task: str | None = "click_button"  # or take_lid_off_saucepan, flip_cup, open_drawer_put_teddy
     fps: int = 10  # control steps a second: 5, 10, 20, 25 or 50
     cameras: list[str] = field(default_factory=lambda: list(CAMERAS))  # left/right_shoulder, upper/lower_wrist
-
-    def check(self) -> None:
-        """Validate what a user may set. Raises ConfigError."""
-        super().check()
-        if self.fps not in (5, 10, 20, 25, 50):
-            raise ConfigError(f"fps is {self.fps}: expected 5, 10, 20, 25 or 50 (whole physics steps of 4 ms).")
 
     @property
     def sizes(self) -> Sizes:

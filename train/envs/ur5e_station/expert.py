@@ -1,4 +1,4 @@
-"""A scripted operator: steers through the same seven-value actions as any policy, and pauses like a person."""
+"""A scripted operator: it steers through the same seven-value actions as any policy, and pauses like a person."""
 
 from typing import Any, Protocol
 
@@ -30,14 +30,10 @@ class Station(Protocol):
         action_space: `gymnasium.spaces.Box`, (7,), the bounds of joint deltas, rad a step, and of the gripper.
     """
 
+    arm: Arm
+    station_task: Task
+    fps: int
     action_space: Any
-
-    @property
-    def arm(self) -> Arm: ...
-    @property
-    def station_task(self) -> Task: ...
-    @property
-    def fps(self) -> int: ...
 
 
 class ScriptedTeleoperator:

@@ -93,7 +93,7 @@ class OpenDrawerPutTeddy(Task):
         arm.data.joint("drawer").qpos[0] = _AJAR
 
     def state(self, arm: Arm) -> Array:
-        """How far the drawer is open, m, and the teddy's middle, (3,) m."""
+        """Opening of the drawer, m, and the teddy's middle, (3,) m."""
         return np.append(_opening(arm), _teddy(arm))
 
     def success(self, arm: Arm) -> bool:

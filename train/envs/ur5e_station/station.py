@@ -1,4 +1,4 @@
-"""The gym environment all tasks of the station share."""
+"""The station as a gymnasium environment, for all of its tasks."""
 
 from typing import Any, ClassVar
 
@@ -39,6 +39,8 @@ class UR5eStation(MujocoEnv):
         task, task_description: name of the task, and the sentence that instructs it.
         state_names, action_names: of `agent_pos` and the action, as LeRobot names motors.
         environment_state_names: of the objects' state.
+        arm: the simulated arm with the scene.
+        station_task: the running task.
         action_kind: what the joint deltas are differences of, as `cqn-data delta --help` names it.
     """
 
@@ -51,15 +53,15 @@ class UR5eStation(MujocoEnv):
             ConfigError: a setting that `UR5eStationEnv` refuses, or mujoco is missing.
         """
         config = UR5eStationEnv(**settings)
-        self._task = TASKS[str(config.task)]()
-        self._arm = Arm(self._task.mjcf())
-        super().__init__(config, self._arm.model)
+        self.station_task: Task = TASKS[str(config.task)]()
+        self.arm = Arm(self.station_task.mjcf())
+        super().__init__(config, self.arm.model)
         self._substeps = round(1.0 / (self.fps * TIMESTEP))
         self._command = np.array(HOME)
-        self.task_description = self._task.description
+        self.task_description = self.station_task.description
         self.state_names = list(STATE_NAMES)
         self.action_names = list(STATE_NAMES)
-        self.environment_state_names = list(self._task.state_names)
+        self.environment_state_names = list(self.station_task.state_names)
         limits = np.array([MAX_JOINT_SPEED / self.fps] * 6 + [1.0], np.float32)
         lowest = np.append(-limits[:6], np.float32(0.0))
         self.action_space = gym.spaces.Box(lowest, limits, dtype=np.float32)
@@ -71,9 +73,9 @@ class UR5eStation(MujocoEnv):
     def _begin(self, seed: int | None) -> Observation:
         """Place arm and objects; an episode follows from its seed alone."""
         joints = np.array(HOME) + self.np_random.uniform(-_HOME_SPREAD, _HOME_SPREAD, 6)
-        self._arm.place(joints, self._task.start_closure)
-        self._task.reset(self._arm, self.np_random)
-        self._arm.forward()
+        self.arm.place(joints, self.station_task.start_closure)
+        self.station_task.reset(self.arm, self.np_random)
+        self.arm.forward()
         self._command = joints
         return self._observe()
 
@@ -84,17 +86,17 @@ class UR5eStation(MujocoEnv):
             DataError: the action is not seven finite numbers.
         """
         checked = self._checked(action)
-        measured = self._arm.joints
+        measured = self.arm.joints
         wanted: NDArray[np.float64] = np.clip(self._command + checked[:6], measured - LEASH, measured + LEASH)
-        wanted = self._arm.clip(wanted)
-        self._arm.drive(self._command, wanted, float(checked[6]), self._substeps)
+        wanted = self.arm.clip(wanted)
+        self.arm.drive(self._command, wanted, float(checked[6]), self._substeps)
         self._command = wanted
-        success = self._task.success(self._arm)
+        success = self.station_task.success(self.arm)
         return self._observe(), float(success), success, False, {"is_success": success}
 
     def render(self) -> NDArray[np.uint8]:
         """The whole station, (360, 480, 3) uint8 RGB."""
-        return self._cameras.picture(self._arm.data, "overview", *RENDER_SIZE, oversample=2)
+        return self._cameras.picture(self.arm.data, "overview", *RENDER_SIZE, oversample=2)
 
     def scripted_teleoperator(
         self, pause_share: float = 0.0, seed: int = 0, tremor_rad: float = 0.0
@@ -102,22 +104,12 @@ class UR5eStation(MujocoEnv):
         """A scripted operator for this environment."""
         return ScriptedTeleoperator(self, pause_share=pause_share, tremor_rad=tremor_rad, seed=seed)
 
-    @property
-    def arm(self) -> Arm:
-        """The simulated arm and scene."""
-        return self._arm
-
-    @property
-    def station_task(self) -> Task:
-        """The running task."""
-        return self._task
-
     def _observe(self) -> Observation:
-        joints = np.append(self._arm.joints, self._arm.closure).astype(np.float32)
+        joints = np.append(self.arm.joints, self.arm.closure).astype(np.float32)
         space = self.observation_space["agent_pos"]
         observation: Observation = {"agent_pos": np.clip(joints, space.low, space.high)}
         if self._with_state:
-            observation["environment_state"] = self._task.state(self._arm).astype(np.float32)
+            observation["environment_state"] = self.station_task.state(self.arm).astype(np.float32)
         if self._camera_names:
-            observation["pixels"] = self._pictures(self._arm.data)
+            observation["pixels"] = self._pictures(self.arm.data)
         return observation

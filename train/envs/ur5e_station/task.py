@@ -1,4 +1,4 @@
-"""What a task of the station is; each task is one file and one entry in `tasks.py`."""
+"""A task of the station; each is one file and one entry in `tasks.py`."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -13,7 +13,7 @@ __all__ = ["Goal", "Task"]
 
 @dataclass(frozen=True)
 class Goal:
-    """Where a skilled operator would steer from the present state.
+    """Place that a skilled operator would steer to from the present state.
 
     Attributes:
         tip: fingertip position to move towards, (3,) m in the world.
@@ -64,5 +64,5 @@ class Task:
         raise NotImplementedError
 
     def goal(self, arm: Arm) -> Goal:
-        """Where to steer now; a function of the present state only, so that cloning it is well posed."""
+        """Place to steer to now; a function of the present state only, so that cloning it is well posed."""
         raise NotImplementedError
