@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("dm_control")
 
 from cqn_train.envs.cameras import Cameras
-from cqn_train.envs.dmc_config import TASKS, DMCEnv, gym_id
+from cqn_train.envs.dmc_config import TASKS, DMCEnv
 from lerobot_cqn.errors import ConfigError, DataError
 
 WALKED = ["acrobot-swingup", "ball_in_cup-catch", "cartpole-swingup", "cheetah-run", "finger-turn_hard", "hopper-hop",
@@ -22,7 +22,7 @@ def make():
     opened = []
 
     def _make(task="cartpole-swingup", **kwargs):
-        env = gym.make(gym_id(task), **kwargs)
+        env = gym.make(DMCEnv(task=task).gym_id, **kwargs)
         opened.append(env)
         return env
 

@@ -11,7 +11,7 @@ pytest.importorskip("metaworld")
 
 from cqn_train.envs import MetaworldSparseEnv
 from cqn_train.envs.cameras import Cameras
-from cqn_train.envs.metaworld_config import CAMERAS, TASKS, gym_id, state_size
+from cqn_train.envs.metaworld_config import CAMERAS, TASKS, state_size
 from cqn_train.envs.simulator import load_mujoco
 from lerobot_cqn.errors import ConfigError, DataError
 
@@ -27,7 +27,7 @@ def make():
     opened = []
 
     def _make(task="drawer-open", **kwargs):
-        env = gym.make(gym_id(task), **kwargs)
+        env = gym.make(MetaworldSparseEnv(task=task).gym_id, **kwargs)
         opened.append(env)
         return env
 

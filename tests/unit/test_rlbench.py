@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from cqn_train.envs import RLBenchEnv
-from cqn_train.envs.rlbench import CAMERAS, TASKS, RLBenchGym
+from cqn_train.envs.rlbench import RLBenchGym
+from cqn_train.envs.rlbench_config import CAMERAS, TASKS
 from lerobot_cqn.errors import ConfigError, DataError
 
 

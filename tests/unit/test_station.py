@@ -11,8 +11,8 @@ pytest.importorskip("mujoco")
 
 import cqn_train.envs
 from cqn_train.envs.cameras import Cameras
-from cqn_train.envs.ur5e_station.config import gym_id
-from cqn_train.envs.ur5e_station.station import CAMERAS, MAX_JOINT_SPEED
+from cqn_train.envs.ur5e_station.config import CAMERAS, UR5eStationEnv
+from cqn_train.envs.ur5e_station.station import MAX_JOINT_SPEED
 from cqn_train.envs.ur5e_station.tasks import TASKS
 from lerobot_cqn.errors import ConfigError, DataError
 
@@ -24,7 +24,7 @@ def make():
     opened = []
 
     def _make(task="click_button", **kwargs):
-        env = gym.make(gym_id(task), **kwargs)
+        env = gym.make(UR5eStationEnv(task=task).gym_id, **kwargs)
         opened.append(env)
         return env
 

@@ -1,21 +1,16 @@
-"""How LeRobot finds gym_aloha with small pictures: `--env.type=aloha_small`. Imports no simulator."""
+"""Settings of gym_aloha with small pictures, `--env.type=aloha_small`. No simulator is imported here."""
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import gymnasium as gym
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_cqn.errors import ConfigError, one_of
+from .env_config import REWARDS, SimEnvConfig, Sizes, check_name, register
 
-from .env_config import SimEnvConfig, Sizes, check_cameras
+__all__ = ["JOINTS", "TASKS", "AlohaSmallEnv"]
 
-__all__ = ["CAMERAS", "FPS", "JOINTS", "REWARDS", "TASKS", "AlohaSmallEnv", "check_settings"]
-
-FPS = 50
-LIMIT = 400  # steps, as in the public datasets
-CAMERAS = ("top", "angle", "front_close", "left_wrist", "right_wrist")
-REWARDS = ("sparse", "dense")
+_LIMIT = 400  # steps, as in the public datasets
+_CAMERAS = ("top", "angle", "front_close", "left_wrist", "right_wrist")
 _ARM = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
 JOINTS = tuple(f"{side}_{joint}" for side in ("left", "right") for joint in _ARM)
 
@@ -31,32 +26,6 @@ TASKS = {
     "transfer_cube": AlohaTask("Pick up the cube with the right arm and transfer it to the left arm.", ("cube",)),
     "insertion": AlohaTask("Insert the peg into the socket.", ("peg", "socket")),
 }
-
-
-def _gym_id(task: str) -> str:
-    return f"cqn_aloha/{task}-v0"
-
-
-for _name in TASKS:
-    if _gym_id(_name) not in gym.registry:
-        gym.register(
-            _gym_id(_name),
-            # As text: the module is imported when an environment is made.
-            entry_point=f"{__package__}.aloha:Aloha",
-            kwargs={"task": _name},
-            max_episode_steps=LIMIT,
-        )
-
-
-def check_settings(
-    task: str, obs_type: str, cameras: list[str] | tuple[str, ...], image_size: int, reward: str
-) -> None:
-    """Validate what a user may set. Raises ConfigError."""
-    if task not in TASKS:
-        raise ConfigError(one_of("task", task, TASKS))
-    check_cameras(obs_type, cameras, CAMERAS, image_size)
-    if reward not in REWARDS:
-        raise ConfigError(one_of("reward", reward, REWARDS))
 
 
 @EnvConfig.register_subclass("aloha_small")
@@ -81,17 +50,22 @@ class AlohaSmallEnv(SimEnvConfig):
         ConfigError: a value that is not one of those named above, or a given feature of another shape.
     """
 
+    gym_name = "cqn_aloha/{task}-v0"
+    tasks = TASKS
+    known_cameras = _CAMERAS
+    rates = (50,)
+    rates_are = "gym_aloha's own"
+
     task: str | None = "transfer_cube"  # transfer_cube or insertion
-    fps: int = FPS  # gym_aloha's
+    fps: int = 50  # gym_aloha's
     obs_type: str = "pixels"  # state, pixels or both
     cameras: list[str] = field(default_factory=lambda: ["top"])  # or angle, front_close, left_wrist, right_wrist
     reward: str = "sparse"  # 1 at success, or "dense": the stages
 
     def check(self) -> None:
         """Validate what a user may set. Raises ConfigError."""
-        check_settings(self.task or "", self.obs_type, self.cameras, self.image_size, self.reward)
-        if self.fps != FPS:
-            raise ConfigError(f"fps is {self.fps}: expected {FPS}, gym_aloha's own.")
+        super().check()
+        check_name("reward", self.reward, REWARDS)
 
     @property
     def sizes(self) -> Sizes:
@@ -99,16 +73,8 @@ class AlohaSmallEnv(SimEnvConfig):
         return Sizes(14, 14, 0 if self.obs_type == "pixels" else 7 * len(TASKS[str(self.task)].objects))
 
     @property
-    def gym_id(self) -> str:
-        """Name of the environment in gymnasium's registry."""
-        return _gym_id(str(self.task))
-
-    @property
     def usual_steps(self) -> int:
-        """Control steps before an episode of the task is cut off, where the user does not say."""
-        return LIMIT
+        return _LIMIT
 
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `gymnasium.make`."""
-        return {**super().gym_kwargs, "reward": self.reward}
+
+register(AlohaSmallEnv, "aloha:Aloha")

@@ -1,19 +1,18 @@
-"""How LeRobot finds the DeepMind Control suite: `--env.type=dmc`. No simulator is imported here."""
+"""Settings of the DeepMind Control suite, `--env.type=dmc`. No simulator is imported here."""
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import gymnasium as gym
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_cqn.errors import ConfigError, one_of
+from lerobot_cqn.errors import ConfigError
 
-from .env_config import SimEnvConfig, Sizes, check_cameras
+from .env_config import SimEnvConfig, Sizes, register
 
-__all__ = ["CAMERAS", "SUITE_STEPS", "TASKS", "DMCEnv", "check_settings", "default_repeat", "gym_id"]
+__all__ = ["TASKS", "DMCEnv"]
 
-CAMERAS = ("camera0",)
-SUITE_STEPS = 1000  # of the suite's own, in an episode of any task
+_CAMERAS = ("camera0",)
+_SUITE_STEPS = 1000  # of the suite's own, in an episode of any task
 _MAX_REPEAT = 20
 
 
@@ -79,42 +78,6 @@ TASKS = {
 }
 
 
-def default_repeat(obs_type: str) -> int:
-    """Suite steps for which an action is held: 1 with state alone, 2 with pictures (the paper's settings)."""
-    return 1 if obs_type == "state" else 2
-
-
-def check_settings(
-    task: str, obs_type: str, cameras: list[str] | tuple[str, ...], image_size: int, action_repeat: int | None
-) -> None:
-    """Validate what a user may set.
-
-    Raises:
-        ConfigError: an unknown task, obs_type or camera, none or a repeated camera, or a number out of range.
-    """
-    if task not in TASKS:
-        raise ConfigError(one_of("DeepMind Control task", task, TASKS))
-    check_cameras(obs_type, cameras, CAMERAS, image_size)
-    if action_repeat is not None and not 1 <= action_repeat <= _MAX_REPEAT:
-        raise ConfigError(f"action_repeat is {action_repeat}: expected 1 to {_MAX_REPEAT}, or nothing.")
-
-
-def gym_id(task: str) -> str:
-    """Name under which gymnasium knows a task."""
-    return f"cqn_dmc/{task}-v0"
-
-
-for _name in TASKS:
-    if gym_id(_name) not in gym.registry:
-        gym.register(
-            gym_id(_name),
-            # As text: the module is imported when an environment is made.
-            entry_point=f"{__package__}.dmc:ControlSuite",
-            kwargs={"task": _name},
-            max_episode_steps=SUITE_STEPS,
-        )
-
-
 @EnvConfig.register_subclass("dmc")
 @dataclass
 class DMCEnv(SimEnvConfig):
@@ -133,20 +96,26 @@ class DMCEnv(SimEnvConfig):
         ConfigError: a value that is not one of those named above, or a given feature of another shape.
     """
 
+    gym_name = "cqn_dmc/{task}-v0"
+    tasks = TASKS
+    known_cameras = _CAMERAS
+
     task: str | None = "cartpole-swingup"  # domain-task, e.g. walker-walk or ball_in_cup-catch
     fps: int = 100  # follows from task and action_repeat
-    cameras: list[str] = field(default_factory=lambda: list(CAMERAS))  # the suite's own
+    cameras: list[str] = field(default_factory=lambda: list(_CAMERAS))  # the suite's own
     action_repeat: int | None = None  # simulator steps an action is held; none: 1 with states, 2 with pictures
 
     def check(self) -> None:
         """Validate what a user may set; fills in fps."""
-        check_settings(self.task or "", self.obs_type, self.cameras, self.image_size, self.action_repeat)
+        super().check()
+        if self.action_repeat is not None and not 1 <= self.action_repeat <= _MAX_REPEAT:
+            raise ConfigError(f"action_repeat is {self.action_repeat}: expected 1 to {_MAX_REPEAT}, or nothing.")
         self.fps = max(1, round(1000 / (TASKS[str(self.task)].step_ms * self.repeat)))
 
     @property
     def repeat(self) -> int:
-        """Suite steps for which an action is held."""
-        return default_repeat(self.obs_type) if self.action_repeat is None else self.action_repeat
+        """Suite steps for which an action is held; where not given the paper's, 1 with state alone, 2 with pictures."""
+        return self.action_repeat or (1 if self.obs_type == "state" else 2)
 
     @property
     def sizes(self) -> Sizes:
@@ -155,16 +124,8 @@ class DMCEnv(SimEnvConfig):
         return Sizes(task.action, 0 if self.obs_type == "pixels" else task.state, 0)
 
     @property
-    def gym_id(self) -> str:
-        """Name of the environment in gymnasium's registry."""
-        return gym_id(str(self.task))
-
-    @property
     def usual_steps(self) -> int:
-        """Control steps before an episode of the task is cut off, where the user does not say."""
-        return SUITE_STEPS // self.repeat
+        return _SUITE_STEPS // self.repeat
 
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `gymnasium.make`."""
-        return {**super().gym_kwargs, "action_repeat": self.repeat}
+
+register(DMCEnv, "dmc:ControlSuite")

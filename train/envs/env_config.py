@@ -1,17 +1,20 @@
-"""What the configurations of all our simulated environments share: fields, features and LeRobot's names for them."""
+"""Base of the simulated environments' configurations: fields, features, LeRobot's and gymnasium's names for them."""
 
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from collections.abc import Collection
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar, NamedTuple
 
+import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from lerobot_cqn.errors import ConfigError, one_of
 
-__all__ = ["OBS_TYPES", "SimEnvConfig", "Sizes", "check_cameras"]
+__all__ = ["REWARDS", "SimEnvConfig", "Sizes", "check_name", "register"]
 
-OBS_TYPES = ("both", "pixels", "state")
+REWARDS = ("sparse", "dense")
+_OBS_TYPES = ("both", "pixels", "state")
 
 
 class Sizes(NamedTuple):
@@ -24,7 +27,7 @@ class Sizes(NamedTuple):
 
 @dataclass
 class SimEnvConfig(EnvConfig):
-    """Base of our environments' configurations: a subclass names the sizes, the gym id and the limits.
+    """Settings of a kind of environment; a subclass says its tasks, cameras, sizes and limits, and is then registered.
 
     An environment made from it observes `agent_pos` and `environment_state`, float32, and `pixels`, a dictionary of
     uint8 (image_size, image_size, 3) by camera, each where `sizes` and `shown_cameras` say so; its `info` always has
@@ -44,6 +47,12 @@ class SimEnvConfig(EnvConfig):
     Raises:
         ConfigError: a value out of range, or a given feature of another shape.
     """
+
+    gym_name: ClassVar[str]  # name in gymnasium's registry, with {task}
+    tasks: ClassVar[Collection[str]]  # names of all there are
+    known_cameras: ClassVar[tuple[str, ...]] = ()  # names of all there are; () where pictures have none
+    rates: ClassVar[tuple[int, ...]] = ()  # values of fps that there are; () where it follows from other fields
+    rates_are: ClassVar[str] = ""  # why there are no others
 
     obs_type: str = "state"  # state (no cameras), pixels (no simulator state) or both
     cameras: list[str] = field(default_factory=list)
@@ -70,12 +79,23 @@ class SimEnvConfig(EnvConfig):
     # -- what a subclass says --------------------------------------------------------------------------------
 
     def check(self) -> None:
-        """Validate what a user may set. Raises ConfigError."""
-        raise NotImplementedError
+        """Validate what a user may set; a subclass goes on with settings of its own. Raises ConfigError."""
+        check_name("task", self.task or "", self.tasks)
+        check_name("obs_type", self.obs_type, _OBS_TYPES)
+        if self.known_cameras:
+            for name in self.cameras:
+                check_name("camera", name, self.known_cameras)
+            if len(set(self.cameras)) != len(self.cameras) or (self.obs_type != "state" and not self.cameras):
+                raise ConfigError(f"cameras is {list(self.cameras)}: expected at least one name, each once.")
+        if not 16 <= self.image_size <= 1024:
+            raise ConfigError(f"image_size is {self.image_size}: expected 16 to 1024 pixels.")
+        if self.rates and self.fps not in self.rates:
+            known = " or ".join(", ".join(map(str, self.rates)).rsplit(", ", 1))
+            raise ConfigError(f"fps is {self.fps}: expected {known} ({self.rates_are}).")
 
     @property
     def sizes(self) -> Sizes:
-        """Of action, `agent_pos` and `environment_state` with the present settings."""
+        """Numbers of action, `agent_pos` and `environment_state` with the present settings."""
         raise NotImplementedError
 
     @property
@@ -91,6 +111,11 @@ class SimEnvConfig(EnvConfig):
         return type(self).__module__
 
     @property
+    def gym_id(self) -> str:
+        """Name of the environment in gymnasium's registry."""
+        return self.gym_name.format(task=self.task)
+
+    @property
     def max_episode_steps(self) -> int:
         """Control steps before an episode is cut off."""
         return self.usual_steps if self.episode_length is None else self.episode_length
@@ -102,14 +127,11 @@ class SimEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `gymnasium.make`."""
-        return {
-            "obs_type": self.obs_type,
-            "cameras": list(self.cameras),
-            "image_size": self.image_size,
-            "render_mode": self.render_mode,
-            "max_episode_steps": self.max_episode_steps,
-        }
+        """Arguments of `gymnasium.make`: the limit, and the fields that concern the environment."""
+        # What LeRobot's own class has is for its commands, but for fps; the length is the limit.
+        elsewhere = {item.name for item in fields(EnvConfig)} - {"fps"} | {"episode_length"}
+        own = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in elsewhere}
+        return {**own, "max_episode_steps": self.max_episode_steps}
 
     def _derived(self) -> dict[str, tuple[PolicyFeature, str]]:
         """Each feature by the environment's name, with the policy's name for it."""
@@ -127,14 +149,25 @@ class SimEnvConfig(EnvConfig):
         return derived
 
 
-def check_cameras(obs_type: str, cameras: list[str] | tuple[str, ...], known: tuple[str, ...], image_size: int) -> None:
-    """Validate an observation type, camera names and a picture size. Raises ConfigError."""
-    if obs_type not in OBS_TYPES:
-        raise ConfigError(one_of("obs_type", obs_type, OBS_TYPES))
-    for name in cameras:
-        if name not in known:
-            raise ConfigError(one_of("camera", name, known))
-    if len(set(cameras)) != len(cameras) or (obs_type != "state" and not cameras):
-        raise ConfigError(f"cameras is {list(cameras)}: expected at least one name, each once.")
-    if not 16 <= image_size <= 1024:
-        raise ConfigError(f"image_size is {image_size}: expected 16 to 1024 pixels.")
+def check_name(what: str, got: str, valid: Collection[str]) -> None:
+    """Refuse a name that is not one of `valid`. Raises ConfigError."""
+    if got not in valid:
+        raise ConfigError(one_of(what, got, valid))
+
+
+def register(config: type[SimEnvConfig], environment: str) -> None:
+    """Make all tasks known to gymnasium.
+
+    Args:
+        config: settings of the environment; its class is registered with LeRobot already.
+        environment: the environment's module and class, as "hil:HilSim"; imported when one is made.
+    """
+    for task in config.tasks:
+        default = config(task=task)
+        if default.gym_id not in gym.registry:
+            gym.register(
+                default.gym_id,
+                entry_point=f"{__package__}.{environment}",
+                kwargs={"task": task},
+                max_episode_steps=default.max_episode_steps,
+            )

@@ -1,61 +1,24 @@
 """gym_hil's simulated Franka arm, seeded and without its expensive renderer."""
 
-import contextlib
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_cqn.errors import ConfigError, one_of
+from .cameras import RENDER_SIZE, make_lean
+from .hil_config import STATE_NAMES, STEP, TASKS, HilSimEnv
+from .hil_expert import HilTeleoperator
+from .sim_env import MujocoEnv, Observation, preserved_numpy_random
+from .simulator import load_mujoco, needed
 
-from .cameras import Cameras
-from .common import RENDER_SIZE, checked_action, dict_space, make_lean
-from .env_config import check_cameras
-from .simulator import load_mujoco
+__all__ = ["HilSim"]
 
-if TYPE_CHECKING:
-    from .hil_expert import HilTeleoperator
-
-__all__ = ["CAMERAS", "FPS", "STATE_SIZE", "STEP", "TASKS", "HilSim", "check_settings", "preserved_numpy_random"]
-
-FPS = 10
-STEP = 0.025  # m, what 1 in the action moves the tool's target; LeRobot's own setting
-CAMERAS = ("front", "wrist")
-_IN_MODEL = {"front": "front", "wrist": "handcam_rgb"}
+_IN_MODEL = {"wrist": "handcam_rgb"}  # our name of a camera, and gym_hil's
 _CLOSED = 255.0  # gym_hil's gripper command
-_STATE_NAMES = (
-    *(f"joint_{i}.pos" for i in range(1, 8)),
-    *(f"joint_{i}.vel" for i in range(1, 8)),
-    *("gripper.command", "tcp.x", "tcp.y", "tcp.z"),
-)
-STATE_SIZE = len(_STATE_NAMES)
 
 
-class HilTask(NamedTuple):
-    """One task of gym_hil: its class, the sentence that instructs it, its limit in steps and its movable objects."""
-
-    simulation: str
-    description: str
-    max_episode_steps: int
-    objects: tuple[str, ...]
-
-
-TASKS = {
-    "pick_cube": HilTask("PandaPickCubeGymEnv", "Pick up the cube.", 100, ("block",)),
-    "arrange_boxes": HilTask(
-        "PandaArrangeBoxesGymEnv",
-        "Put each box on the field of its colour.",
-        500,
-        tuple(f"block{i}" for i in range(1, 6)),
-    ),
-}
-
-Observation = dict[str, Any]
-
-
-class HilSim(gym.Env[Observation, NDArray[np.float32]]):
+class HilSim(MujocoEnv):
     """gym_hil's Franka Panda with a gripper over a floor, in MuJoCo at 10 Hz; sparse reward.
 
     Its physics, controller, start and success are gym_hil's own; only seeding, pictures and the gripper's convention
@@ -76,56 +39,34 @@ class HilSim(gym.Env[Observation, NDArray[np.float32]]):
     Attributes:
         task, task_description: name of the task, and the sentence that instructs it.
         state_names, action_names, environment_state_names: of the numbers above.
+        objects: names of the movable objects.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": FPS}
-
-    def __init__(
-        self,
-        task: str = "pick_cube",
-        obs_type: str = "state",
-        cameras: list[str] | tuple[str, ...] = CAMERAS,
-        image_size: int = 84,
-        random_position: bool = True,
-        render_mode: str | None = "rgb_array",
-    ) -> None:
-        """Build the scene; no graphics context is opened before the first picture.
+    def __init__(self, **settings: Any) -> None:
+        """Build the scene from fields of `HilSimEnv`.
 
         Raises:
-            ConfigError: an unknown task, obs_type or camera; a size out of range; gym_hil is missing.
+            ConfigError: a setting that `HilSimEnv` refuses, or gym_hil is missing.
         """
-        check_settings(task, obs_type, cameras, image_size)
-        self._objects = TASKS[task].objects
-        self._sim = _simulation(task, random_position)
-        make_lean(self._sim.model, image_size)
-        self._cameras = Cameras(self._sim.model)
-        self._camera_names = tuple(cameras) if obs_type != "state" else ()
-        self._with_state = obs_type != "pixels"
-        self._image_size = image_size
-        self.fps = FPS
-        self.render_mode = render_mode
-        self.task = task
-        self.task_description = TASKS[task].description
-        self.state_names = list(_STATE_NAMES)
+        config = HilSimEnv(**settings)
+        task = TASKS[str(config.task)]
+        self._sim = _simulation(task.simulation, config)
+        make_lean(self._sim.model, config.image_size)
+        super().__init__(config, self._sim.model)
+        self.objects = task.objects
+        self.task_description = task.description
+        self.state_names = list(STATE_NAMES)
         self.action_names = ["delta_x", "delta_y", "delta_z", "gripper"]
-        self.environment_state_names = [f"{name}.{axis}" for name in self._objects for axis in "xyz"]
+        self.environment_state_names = [f"{name}.{axis}" for name in self.objects for axis in "xyz"]
         lowest = np.array([-1.0, -1.0, -1.0, 0.0], np.float32)
         self.action_space = gym.spaces.Box(lowest, np.ones(4, np.float32), dtype=np.float32)
-        states = len(self.environment_state_names) if self._with_state else 0
-        self.observation_space = dict_space(STATE_SIZE, states, self._camera_names, image_size)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; the same `seed` gives the same episode, without one the random stream goes on.
-
-        `options` is accepted for callers that pass marks of their own; none changes anything.
-        """
-        super().reset(seed=seed)
+    def _begin(self, seed: int | None) -> Observation:
+        """Lay the scene out; an episode follows from its seed alone."""
         # gym_hil ignores a seed and draws from numpy's global state.
         with preserved_numpy_random(int(self.np_random.integers(2**32))):
             self._sim.reset()
-        return self._observe(), {"is_success": False}
+        return self._observe()
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Apply one action for 0.1 s.
@@ -133,7 +74,7 @@ class HilSim(gym.Env[Observation, NDArray[np.float32]]):
         Raises:
             DataError: the action is not four finite numbers.
         """
-        checked = checked_action(action, self.action_space, self.action_names)
+        checked = self._checked(action)
         # gym_hil's own action is a change of the gripper's closure.
         native = np.concatenate([checked[:3] * STEP, np.zeros(3), [checked[3] - self.closure]])
         _, reward, terminated, _, _ = self._sim.step(native)
@@ -144,14 +85,8 @@ class HilSim(gym.Env[Observation, NDArray[np.float32]]):
         """The front camera, (360, 480, 3) uint8 RGB."""
         return self._cameras.picture(self._sim.data, "front", *RENDER_SIZE)
 
-    def close(self) -> None:
-        """Release graphics contexts; calling it twice is harmless."""
-        self._cameras.close()
-
-    def scripted_teleoperator(self, pause_share: float = 0.0, seed: int = 0) -> "HilTeleoperator":
-        """A scripted operator for this environment; see `hil_expert.HilTeleoperator`."""
-        from .hil_expert import HilTeleoperator
-
+    def scripted_teleoperator(self, pause_share: float = 0.0, seed: int = 0) -> HilTeleoperator:
+        """A scripted operator for this environment."""
         return HilTeleoperator(self, pause_share=pause_share, seed=seed)
 
     # -- what the scripted operator sees ----------------------------------------------------------------------
@@ -172,11 +107,6 @@ class HilSim(gym.Env[Observation, NDArray[np.float32]]):
         target: NDArray[np.float64] = self._sim.data.mocap_pos[0].copy()
         return target
 
-    @property
-    def objects(self) -> tuple[str, ...]:
-        """Names of the movable objects."""
-        return self._objects
-
     def place(self, name: str) -> NDArray[np.float64]:
         """Position of an object or field, (3,) m."""
         position: NDArray[np.float64] = self._sim.data.sensor(f"{name}_pos").data.copy()
@@ -187,58 +117,29 @@ class HilSim(gym.Env[Observation, NDArray[np.float32]]):
     def _observe(self) -> Observation:
         observation: Observation = {"agent_pos": self._sim.get_robot_state().astype(np.float32)}
         if self._with_state:
-            places = np.concatenate([self.place(name) for name in self._objects])
+            places = np.concatenate([self.place(name) for name in self.objects])
             observation["environment_state"] = places.astype(np.float32)
         if self._camera_names:
-            size = self._image_size
-            observation["pixels"] = {
-                name: self._cameras.picture(self._sim.data, _IN_MODEL[name], size, size) for name in self._camera_names
-            }
+            observation["pixels"] = self._pictures(self._sim.data, _IN_MODEL)
         return observation
 
 
-def check_settings(task: str, obs_type: str, cameras: list[str] | tuple[str, ...], image_size: int) -> None:
-    """Validate what a user may set.
-
-    Raises:
-        ConfigError: an unknown task, obs_type or camera, none or a repeated camera, or a size out of range.
-    """
-    if task not in TASKS:
-        raise ConfigError(one_of("task", task, TASKS))
-    check_cameras(obs_type, cameras, CAMERAS, image_size)
-
-
-@contextlib.contextmanager
-def preserved_numpy_random(seed: int) -> Iterator[None]:
-    """Seed numpy's global random state inside, and put the caller's back afterwards."""
-    before = np.random.get_state()
-    np.random.seed(seed)
-    try:
-        yield
-    finally:
-        np.random.set_state(before)
-
-
 class _NoRenderer:
-    """Stands in while gym_hil builds a scene: it would open a renderer even where nobody looks."""
+    """Stand-in while gym_hil builds a scene: it would open a renderer even where nobody looks."""
 
     def __init__(self, *_: Any, **__: Any) -> None: ...
 
     def render(self) -> None: ...
 
 
-def _simulation(task: str, random_position: bool) -> Any:
-    try:
+def _simulation(name: str, config: HilSimEnv) -> Any:
+    """gym_hil's environment. Raises ConfigError where it is not installed."""
+    with needed("The environment 'hil_sim' needs gym_hil", "hil"):
         mujoco = load_mujoco()
         from gym_hil import envs
-    except (ImportError, ConfigError) as error:
-        raise ConfigError(
-            "The environment 'hil_sim' needs gym_hil, which is not installed: "
-            "run `pip install 'lerobot_policy_cqn[hil]'`."
-        ) from error
-    chosen = {"random_block_position": random_position} if task == "pick_cube" else {}
+    chosen = {"random_block_position": config.random_position} if config.task == "pick_cube" else {}
     renderer, mujoco.Renderer = mujoco.Renderer, _NoRenderer
     try:
-        return getattr(envs, TASKS[task].simulation)(**chosen)
+        return getattr(envs, name)(**chosen)
     finally:
         mujoco.Renderer = renderer

@@ -1,31 +1,41 @@
-"""How LeRobot finds gym_hil's simulation without its window: `--env.type=hil_sim`. Imports no simulator."""
+"""Settings of gym_hil's simulation, `--env.type=hil_sim`. No simulator is imported here."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import NamedTuple
 
-import gymnasium as gym
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_cqn.errors import ConfigError
+from .env_config import SimEnvConfig, Sizes, register
 
-from .env_config import SimEnvConfig, Sizes
-from .hil import CAMERAS, FPS, STATE_SIZE, TASKS, HilSim, check_settings
+__all__ = ["STATE_NAMES", "STEP", "TASKS", "HilSimEnv"]
 
-__all__ = ["HilSimEnv"]
+STEP = 0.025  # m, what 1 in the action moves the tool's target; LeRobot's own setting
+_CAMERAS = ("front", "wrist")
+STATE_NAMES = (
+    *(f"joint_{i}.pos" for i in range(1, 8)),
+    *(f"joint_{i}.vel" for i in range(1, 8)),
+    *("gripper.command", "tcp.x", "tcp.y", "tcp.z"),
+)
 
 
-def _gym_id(task: str) -> str:
-    return f"cqn_hil/{task}-v0"
+class HilTask(NamedTuple):
+    """One task of gym_hil: its class, the sentence that instructs it, its limit in steps and its movable objects."""
+
+    simulation: str
+    description: str
+    max_episode_steps: int
+    objects: tuple[str, ...]
 
 
-for _name, _task in TASKS.items():
-    if _gym_id(_name) not in gym.registry:
-        gym.register(
-            _gym_id(_name),
-            entry_point=f"{HilSim.__module__}:{HilSim.__qualname__}",
-            kwargs={"task": _name},
-            max_episode_steps=_task.max_episode_steps,
-        )
+TASKS = {
+    "pick_cube": HilTask("PandaPickCubeGymEnv", "Pick up the cube.", 100, ("block",)),
+    "arrange_boxes": HilTask(
+        "PandaArrangeBoxesGymEnv",
+        "Put each box on the field of its colour.",
+        500,
+        tuple(f"block{i}" for i in range(1, 6)),
+    ),
+}
 
 
 @EnvConfig.register_subclass("hil_sim")
@@ -47,33 +57,25 @@ class HilSimEnv(SimEnvConfig):
         ConfigError: a value that is not one of those named above, or a given feature of another shape.
     """
 
-    task: str | None = "pick_cube"  # pick_cube or arrange_boxes
-    fps: int = FPS  # gym_hil's
-    random_position: bool = True  # objects placed anew in each episode
-    cameras: list[str] = field(default_factory=lambda: list(CAMERAS))  # front, wrist
+    gym_name = "cqn_hil/{task}-v0"
+    tasks = TASKS
+    known_cameras = _CAMERAS
+    rates = (10,)
+    rates_are = "the rate of gym_hil's controller"
 
-    def check(self) -> None:
-        """Validate what a user may set. Raises ConfigError."""
-        check_settings(self.task or "", self.obs_type, self.cameras, self.image_size)
-        if self.fps != FPS:
-            raise ConfigError(f"fps is {self.fps}: expected {FPS}, the rate of gym_hil's controller.")
+    task: str | None = "pick_cube"  # pick_cube or arrange_boxes
+    fps: int = 10  # gym_hil's
+    random_position: bool = True  # objects placed anew in each episode
+    cameras: list[str] = field(default_factory=lambda: list(_CAMERAS))  # front, wrist
 
     @property
     def sizes(self) -> Sizes:
         """Movement and gripper; gym_hil's state of the arm; a position an object."""
-        return Sizes(4, STATE_SIZE, 0 if self.obs_type == "pixels" else 3 * len(TASKS[str(self.task)].objects))
-
-    @property
-    def gym_id(self) -> str:
-        """Name of the environment in gymnasium's registry."""
-        return _gym_id(str(self.task))
+        return Sizes(4, len(STATE_NAMES), 0 if self.obs_type == "pixels" else 3 * len(TASKS[str(self.task)].objects))
 
     @property
     def usual_steps(self) -> int:
-        """Control steps before an episode of the task is cut off, where the user does not say."""
         return TASKS[str(self.task)].max_episode_steps
 
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `gymnasium.make`."""
-        return {**super().gym_kwargs, "random_position": self.random_position}
+
+register(HilSimEnv, "hil:HilSim")

@@ -1,21 +1,15 @@
-"""A scripted operator for gym_hil's tasks: steers through the same four values as any policy, and pauses."""
+"""A scripted operator for gym_hil's tasks: it steers through the same four values as any policy, and pauses."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_cqn.errors import ConfigError
-
-from .hil import STEP
-
-if TYPE_CHECKING:
-    from .hil import HilSim
+from .hil_config import STEP
+from .pauses import Pauses
 
 __all__ = ["HilTeleoperator"]
 
-_PAUSE_STEPS = (3, 15)  # shortest and longest hesitation, control steps
-_MEAN_PAUSE = sum(_PAUSE_STEPS) / 2
 _MOVES = 18  # steps without pauses to pick up one object, about
 _OVER = np.array([0.0, 0.0, 0.09])  # m, from an object to where the tool lines up
 _ALIGNED = 0.012  # m, near enough across the floor to go down
@@ -25,15 +19,38 @@ _UP = np.array([0.0, 0.0, STEP])  # m, one step
 
 
 class Goal(NamedTuple):
-    """Where the tool's target shall go, (3,) m, the gripper's closure, and a moment at which a person would stop."""
+    """Place that the tool's target shall go to, (3,) m, the gripper's closure, and moments at which a person stops."""
 
     target: NDArray[np.float64]
     closure: float
-    moment: str = ""
+    moments: tuple[str, ...] = ()
+
+
+class Tool(Protocol):
+    """Simulated gripper among objects, as the operator sees it.
+
+    Attributes:
+        objects: names of the movable objects.
+        closure: the gripper's command, 0 (open) to 1 (closed).
+        tip: measured position of the tool, (3,) m.
+        target: position the tool is sent to, (3,) m.
+    """
+
+    objects: tuple[str, ...]
+
+    @property
+    def closure(self) -> float: ...
+    @property
+    def tip(self) -> NDArray[np.float64]: ...
+    @property
+    def target(self) -> NDArray[np.float64]: ...
+
+    def place(self, name: str) -> NDArray[np.float64]:
+        """Position of an object or field, (3,) m."""
 
 
 class HilTeleoperator:
-    """Goes over an object, down, grasps, lifts, and in `arrange_boxes` carries it to its field.
+    """Operator that goes over an object, down, grasps, lifts, and in `arrange_boxes` carries it to its field.
 
     While moving, the action depends on the present state alone. While pausing it is a zero movement with the gripper
     as it was. Pauses come at the start, before grasping and at random.
@@ -44,7 +61,7 @@ class HilTeleoperator:
 
     pausing: bool
 
-    def __init__(self, env: "HilSim", pause_share: float = 0.0, seed: int = 0) -> None:
+    def __init__(self, env: Tool, pause_share: float = 0.0, seed: int = 0) -> None:
         """Steer `env` (unwrapped).
 
         Args:
@@ -55,41 +72,23 @@ class HilTeleoperator:
         Raises:
             ConfigError: a value out of range.
         """
-        if not 0.0 <= pause_share <= 0.9:
-            raise ConfigError(f"pause_share is {pause_share}: expected 0 to 0.9.")
         self._env = env
-        still_per_move = pause_share / (1.0 - pause_share)
-        self._natural = min(1.0, still_per_move)  # probability of a pause at the start and before a grasp
-        moves = _MOVES * len(env.objects)
-        expected = (1 + len(env.objects)) * self._natural * _MEAN_PAUSE / moves
-        self._hazard = float(np.clip((still_per_move - expected) / _MEAN_PAUSE, 0.0, 1.0))
+        self._pauses = Pauses(pause_share, 1 + len(env.objects), _MOVES * len(env.objects))
         self.reset(seed)
 
     def reset(self, seed: int) -> None:
         """Begin an episode; call it after the environment's reset. The same seed gives the same pauses."""
-        self._rng = np.random.default_rng(seed)
-        self._left = self._pause() if self._rng.random() < self._natural else 0
-        self._hesitated: set[str] = set()
+        self._pauses.reset(np.random.default_rng(seed))
         self.pausing = False
 
     def act(self) -> NDArray[np.float32]:
         """Action for the present state, (4,) float32 within the action space."""
         goal = self._goal()
-        if self._left == 0:
-            if goal.moment and goal.moment not in self._hesitated:
-                self._hesitated.add(goal.moment)
-                self._left = self._pause() if self._rng.random() < self._natural else 0
-            elif self._rng.random() < self._hazard:
-                self._left = self._pause()
-        self.pausing = self._left > 0
+        self.pausing = self._pauses.next(goal.moments)
         if self.pausing:
-            self._left -= 1
             goal = Goal(self._env.target, round(self._env.closure))
         move = np.clip((goal.target - self._env.target) / STEP, -1.0, 1.0)
         return np.append(move, goal.closure).astype(np.float32)
-
-    def _pause(self) -> int:
-        return int(self._rng.integers(_PAUSE_STEPS[0], _PAUSE_STEPS[1] + 1))
 
     def _goal(self) -> Goal:
         env = self._env
@@ -108,7 +107,7 @@ class HilTeleoperator:
         if offset > _ALIGNED and not (offset < 2 * _ALIGNED and tip[2] - place[2] < 0.06):
             return Goal(place + _OVER, 0.0)
         if tip[2] - place[2] > _ALIGNED:
-            return Goal(place, 0.0, f"grasp {name}" if tip[2] - place[2] < 0.03 else "")
+            return Goal(place, 0.0, (f"grasp {name}",) if tip[2] - place[2] < 0.03 else ())
         return Goal(self._env.target, 1.0)
 
     def _carry(self, name: str, field: NDArray[np.float64] | None) -> Goal:

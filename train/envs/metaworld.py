@@ -7,12 +7,11 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_cqn.errors import ConfigError
-
-from .cameras import Cameras
-from .common import RENDER_SIZE, checked_action, dict_space, make_lean
-from .metaworld_config import DEFAULT_CAMERAS, SIMULATOR_HZ, TASKS, canonical_task, check_settings, state_size
-from .simulator import load_mujoco
+from .cameras import RENDER_SIZE, make_lean
+from .metaworld_config import SIMULATOR_HZ, TASKS, MetaworldSparseEnv, state_size
+from .pauses import Pauses
+from .sim_env import MujocoEnv, Observation
+from .simulator import load_mujoco, needed
 
 __all__ = ["MetaworldSparse", "ScriptedTeleoperator"]
 
@@ -20,17 +19,13 @@ NAMES = ("hand_x", "hand_y", "hand_z", "gripper")
 _HAND = 4  # leading numbers of Meta-World's own observation: hand and gripper
 _FRAME = 18  # numbers of one of its two frames; behind the hand two poses, padded with zeros
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
-_PAUSE_STEPS = (3, 15)  # shortest and longest hesitation, control steps
-_MEAN_PAUSE = sum(_PAUSE_STEPS) / 2
 _UPSIDE_DOWN = ("corner", "corner2", "corner3")
 _USUAL_GAIN = 25.0  # of the experts, per m: what they multiply the way that is left with
 _METRES = 0.01  # displacement in a simulator step by an action of 1
 _CORNER2 = (0.75, 0.075, 0.7)  # m; nearer to the table than Meta-World's own
 
-Observation = dict[str, Any]
 
-
-class MetaworldSparse(gym.Env[Observation, NDArray[np.float32]]):
+class MetaworldSparse(MujocoEnv):
     """One of Meta-World's tasks.
 
     Action, (4,) float32 in [-1, 1]: the hand's displacement along x, y, z, 1 for a centimetre in each simulator step,
@@ -50,63 +45,43 @@ class MetaworldSparse(gym.Env[Observation, NDArray[np.float32]]):
         task, task_description: Meta-World's name of the task, and the sentence that instructs it.
         state_names, action_names: of `agent_pos` and the action.
         environment_state_names: of objects and goal.
+        simulator: Meta-World's environment (`SawyerXYZEnv`).
+        raw_observation: (39,) Meta-World's own observation: present and former frame of 18 numbers, and the goal.
+        repeat: simulator steps for which an action is held.
         action_kind: "command": each action stands for itself, so that leaving steps out changes no other.
     """
 
     action_kind: ClassVar[str] = "command"
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 20}
-
-    def __init__(
-        self,
-        task: str = "drawer-open-v3",
-        obs_type: str = "state",
-        cameras: list[str] | tuple[str, ...] = DEFAULT_CAMERAS,
-        image_size: int = 84,
-        fps: int = 20,
-        render_mode: str | None = "rgb_array",
-    ) -> None:
-        """Build the scene; no graphics context is opened before the first picture.
+    def __init__(self, **settings: Any) -> None:
+        """Build the scene from fields of `MetaworldSparseEnv`.
 
         Raises:
-            ConfigError: an unknown task, obs_type or camera; a size or rate out of range; metaworld is missing.
+            ConfigError: a setting that `MetaworldSparseEnv` refuses, or metaworld is missing.
         """
-        check_settings(task, obs_type, cameras, image_size, fps)
-        self.task = canonical_task(task)
-        self.task_description = TASKS[self.task.removesuffix("-v3")]
-        self._mujoco, make, self._expert = _load(self.task)
-        self._simulator = make()
-        self._simulator.seeded_rand_vec = True
-        self._simulator._set_task_called = True
+        config = MetaworldSparseEnv(**settings)
+        self._mujoco, make, self._expert = _load(str(config.task))
+        self.simulator = make()
+        self.simulator.seeded_rand_vec = True
+        self.simulator._set_task_called = True
         # Longer episodes are the time limit's affair; Meta-World would raise.
-        self._simulator.max_path_length = 10**9
-        make_lean(self._simulator.model, image_size)
-        _place_cameras(self._simulator.model)
-        self._cameras = Cameras(self._simulator.model)
-        self._camera_names = tuple(cameras) if obs_type != "state" else ()
-        self._state_size = 0 if obs_type == "pixels" else state_size(self.task)
-        self._image_size = image_size
-        self._repeat = SIMULATOR_HZ // fps
-        self._raw: NDArray[np.float64] = np.zeros(2 * _FRAME + 3)
-        self.render_mode = render_mode
-        self.metadata = {**type(self).metadata, "render_fps": fps}  # type: ignore[misc]
+        self.simulator.max_path_length = 10**9
+        make_lean(self.simulator.model, config.image_size)
+        _place_cameras(self.simulator.model)
+        super().__init__(config, self.simulator.model)
+        self.repeat = SIMULATOR_HZ // config.fps
+        self.raw_observation: NDArray[np.float64] = np.zeros(2 * _FRAME + 3)
+        self.task_description = TASKS[self.task.removesuffix("-v3")]
         self.state_names = list(NAMES)
         self.action_names = list(NAMES)
-        poses = (state_size(self.task) - 3) // 7
-        objects = [f"object{i or ''}_{axis}" for i in range(poses) for axis in _POSE]
+        self._poses = state_size(self.task) - 3
+        objects = [f"object{i or ''}_{axis}" for i in range(self._poses // 7) for axis in _POSE]
         self.environment_state_names = [*objects, "goal_x", "goal_y", "goal_z"]
         self.action_space = gym.spaces.Box(-1.0, 1.0, (4,), np.float32)
-        self.observation_space = dict_space(_HAND, self._state_size, self._camera_names, image_size)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; the same `seed` gives the same episode, without one the random stream goes on.
-
-        `options` is accepted for callers that pass marks of their own; none changes anything.
-        """
-        super().reset(seed=seed)
-        simulator = self._simulator
+    def _begin(self, seed: int | None) -> Observation:
+        """Lay the scene out; an episode follows from its seed alone."""
+        simulator = self.simulator
         if seed is not None:
             simulator.seed(seed)
         # Meta-World's reset lays the scene out twice and measures the goal in between: places drawn anew for the
@@ -119,8 +94,8 @@ class MetaworldSparse(gym.Env[Observation, NDArray[np.float32]]):
         # It moves objects last and looks at them without this.
         self._mujoco.mj_forward(simulator.model, simulator.data)
         frame = simulator._get_curr_obs_combined_no_goal()
-        self._raw = np.concatenate([frame, frame, simulator._get_pos_goal()])
-        return self._observe(), {"is_success": False}
+        self.raw_observation = np.concatenate([frame, frame, simulator._get_pos_goal()])
+        return self._observe()
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Apply one action for 1 / fps seconds, or until success.
@@ -128,56 +103,36 @@ class MetaworldSparse(gym.Env[Observation, NDArray[np.float32]]):
         Raises:
             DataError: the action is not four finite numbers.
         """
-        checked = checked_action(action, self.action_space, self.action_names)
+        checked = self._checked(action)
         success = False
-        for _ in range(self._repeat):
-            raw, _, _, _, info = self._simulator.step(checked)
+        for _ in range(self.repeat):
+            raw, _, _, _, info = self.simulator.step(checked)
             success = bool(info["success"])
             if success:
                 break
-        self._raw = np.concatenate([raw[: 2 * _FRAME], self._simulator._get_pos_goal()])
+        self.raw_observation = np.concatenate([raw[: 2 * _FRAME], self.simulator._get_pos_goal()])
         return self._observe(), float(success), success, False, {"is_success": success}
 
     def render(self) -> NDArray[np.uint8]:
         """The table from the corner, (360, 480, 3) uint8 RGB."""
-        return self._cameras.picture(self._simulator.data, "corner2", *RENDER_SIZE)
-
-    def close(self) -> None:
-        """Release graphics contexts; calling it twice is harmless."""
-        self._cameras.close()
+        return self._cameras.picture(self.simulator.data, "corner2", *RENDER_SIZE)
 
     def scripted_teleoperator(self, pause_share: float = 0.0, seed: int = 0) -> "ScriptedTeleoperator":
         """Meta-World's own expert for the task; see `ScriptedTeleoperator`."""
         return ScriptedTeleoperator(self, pause_share=pause_share, seed=seed)
-
-    @property
-    def raw_observation(self) -> NDArray[np.float64]:
-        """(39,) Meta-World's own observation: present and former frame of 18 numbers, and the goal."""
-        return self._raw
-
-    @property
-    def repeat(self) -> int:
-        """Simulator steps for which an action is held."""
-        return self._repeat
-
-    @property
-    def simulator(self) -> Any:
-        """Meta-World's environment (`SawyerXYZEnv`)."""
-        return self._simulator
 
     def make_expert(self) -> Any:
         """A new scripted policy of Meta-World's for the task, from raw observation to action."""
         return self._expert()
 
     def _observe(self) -> Observation:
-        raw = self._raw.astype(np.float32)
+        raw = self.raw_observation.astype(np.float32)
         observation: Observation = {"agent_pos": raw[:_HAND]}
-        if self._state_size:
-            objects = raw[_HAND : _HAND + self._state_size - 3]
+        if self._with_state:
+            objects = raw[_HAND : _HAND + self._poses]
             observation["environment_state"] = np.concatenate([objects, raw[-3:]])
         if self._camera_names:
-            size, data = self._image_size, self._simulator.data
-            observation["pixels"] = {n: self._cameras.picture(data, n, size, size) for n in self._camera_names}
+            observation["pixels"] = self._pictures(self.simulator.data)
         return observation
 
 
@@ -205,31 +160,22 @@ class ScriptedTeleoperator:
         Raises:
             ConfigError: a share out of range.
         """
-        if not 0.0 <= pause_share <= 0.9:
-            raise ConfigError(f"pause_share is {pause_share}: expected 0 to 0.9.")
         self._env = env
         self._damping = _damping(env.repeat)
-        self._hazard = min(1.0, pause_share / (1.0 - pause_share) / _MEAN_PAUSE)
+        self._pauses = Pauses(pause_share)
         self.reset(seed)
 
     def reset(self, seed: int) -> None:
         """Begin an episode; call it after the environment's reset. The same seed gives the same pauses."""
-        self._rng = np.random.default_rng(seed)
+        self._pauses.reset(np.random.default_rng(seed))
         self._expert = self._env.make_expert()
         self._gripper = -1.0
-        self._left = 0
-        self._moved = True
         self.pausing = False
 
     def act(self) -> NDArray[np.float32]:
         """Action for the present state, (4,) float32 in [-1, 1]."""
-        # A step between two pauses, or the shares would not add up.
-        if self._left == 0 and self._moved and self._rng.random() < self._hazard:
-            self._left = int(self._rng.integers(_PAUSE_STEPS[0], _PAUSE_STEPS[1] + 1))
-        self.pausing = self._left > 0
-        self._moved = not self.pausing
+        self.pausing = self._pauses.next()
         if self.pausing:
-            self._left -= 1
             return np.array([0.0, 0.0, 0.0, self._gripper], np.float32)
         with warnings.catch_warnings():
             # It warns whenever a displacement is clipped, which is how it moves fast.
@@ -258,13 +204,8 @@ def _place_cameras(model: Any) -> None:
 
 def _load(task: str) -> tuple[Any, Any, Any]:
     """The mujoco module, and Meta-World's environment and expert classes for a task."""
-    try:
+    with needed("Meta-World's tasks need metaworld", "metaworld"):
         mujoco = load_mujoco()
         from metaworld.env_dict import ALL_V3_ENVIRONMENTS
         from metaworld.policies import ENV_POLICY_MAP
-    except (ImportError, ConfigError) as error:
-        raise ConfigError(
-            "Meta-World's tasks need metaworld, which is not installed: "
-            "run `pip install 'lerobot_policy_cqn[metaworld]'`."
-        ) from error
     return mujoco, ALL_V3_ENVIRONMENTS[task], ENV_POLICY_MAP[task]

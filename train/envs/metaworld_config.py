@@ -1,33 +1,17 @@
-"""How LeRobot finds Meta-World with sparse rewards: `--env.type=metaworld_sparse`. No simulator is imported here."""
+"""Settings of Meta-World with sparse rewards, `--env.type=metaworld_sparse`. No simulator is imported here."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
-import gymnasium as gym
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_cqn.errors import ConfigError, one_of
+from .env_config import SimEnvConfig, Sizes, check_name, register
 
-from .env_config import SimEnvConfig, Sizes, check_cameras
-
-__all__ = [
-    "CAMERAS",
-    "DEFAULT_CAMERAS",
-    "HORIZON_S",
-    "SIMULATOR_HZ",
-    "TASKS",
-    "MetaworldSparseEnv",
-    "canonical_task",
-    "check_settings",
-    "gym_id",
-    "state_size",
-]
+__all__ = ["CAMERAS", "SIMULATOR_HZ", "TASKS", "MetaworldSparseEnv", "state_size"]
 
 CAMERAS = ("corner", "corner2", "corner3", "topview", "behindGripper", "gripperPOV")
-DEFAULT_CAMERAS = ("corner2", "gripperPOV")
+_DEFAULT_CAMERAS = ("corner2", "gripperPOV")
 SIMULATOR_HZ = 80  # Meta-World's own control rate
-RATES = (10, 20, 40, 80)
-HORIZON_S = 5  # seconds before an episode is cut off: 100 steps at 20 Hz
+_HORIZON_S = 5  # seconds before an episode is cut off: 100 steps at 20 Hz
 _VERSION = "-v3"
 
 # Task without its version, and the sentence that instructs it.
@@ -86,49 +70,9 @@ TASKS = {
 _TWO_OBJECTS = ("hammer", "stick-pull", "stick-push")
 
 
-def canonical_task(task: str) -> str:
-    """Meta-World's name of a task given with or without its version: "drawer-open" is "drawer-open-v3".
-
-    Raises:
-        ConfigError: there is no such task.
-    """
-    name = task.removesuffix(_VERSION)
-    if name not in TASKS:
-        raise ConfigError(one_of("Meta-World task", name, TASKS))
-    return name + _VERSION
-
-
 def state_size(task: str) -> int:
     """Numbers in `environment_state`: a pose of seven for each object, and the goal's three."""
     return (14 if task.removesuffix(_VERSION) in _TWO_OBJECTS else 7) + 3
-
-
-def check_settings(task: str, obs_type: str, cameras: list[str] | tuple[str, ...], image_size: int, fps: int) -> None:
-    """Validate what a user may set.
-
-    Raises:
-        ConfigError: an unknown task, obs_type or camera, none or a repeated camera, or a number out of range.
-    """
-    canonical_task(task)
-    check_cameras(obs_type, cameras, CAMERAS, image_size)
-    if fps not in RATES:
-        raise ConfigError(f"fps is {fps}: expected 10, 20, 40 or 80 (whole steps of Meta-World's 80 Hz).")
-
-
-def gym_id(task: str) -> str:
-    """Name under which gymnasium knows a task, given with or without its version."""
-    return f"cqn_metaworld/{canonical_task(task)}"
-
-
-for _task in TASKS:
-    if gym_id(_task) not in gym.registry:
-        gym.register(
-            gym_id(_task),
-            # As text: the module is imported when an environment is made.
-            entry_point=f"{__package__}.metaworld:MetaworldSparse",
-            kwargs={"task": _task},
-            max_episode_steps=HORIZON_S * 20,
-        )
 
 
 @EnvConfig.register_subclass("metaworld_sparse")
@@ -148,14 +92,22 @@ class MetaworldSparseEnv(SimEnvConfig):
         ConfigError: a value that is not one of those named above, or a given feature of another shape.
     """
 
+    gym_name = "cqn_metaworld/{task}"
+    tasks = tuple(task + _VERSION for task in TASKS)
+    known_cameras = CAMERAS
+    rates = (10, 20, 40, 80)
+    rates_are = "whole steps of Meta-World's 80 Hz"
+
     task: str | None = "drawer-open-v3"  # one of Meta-World's 50; docs/environments.md lists 20
     fps: int = 20  # control steps a second: 10, 20, 40 or 80
-    cameras: list[str] = field(default_factory=lambda: list(DEFAULT_CAMERAS))  # or others of Meta-World's six
+    cameras: list[str] = field(default_factory=lambda: list(_DEFAULT_CAMERAS))  # or others of Meta-World's six
 
     def check(self) -> None:
         """Validate what a user may set; completes the task's name."""
-        check_settings(self.task or "", self.obs_type, self.cameras, self.image_size, self.fps)
-        self.task = canonical_task(str(self.task))
+        name = (self.task or "").removesuffix(_VERSION)
+        check_name("Meta-World task", name, TASKS)
+        self.task = name + _VERSION
+        super().check()
 
     @property
     def sizes(self) -> Sizes:
@@ -163,16 +115,8 @@ class MetaworldSparseEnv(SimEnvConfig):
         return Sizes(4, 4, 0 if self.obs_type == "pixels" else state_size(str(self.task)))
 
     @property
-    def gym_id(self) -> str:
-        """Name of the environment in gymnasium's registry."""
-        return gym_id(str(self.task))
-
-    @property
     def usual_steps(self) -> int:
-        """Control steps before an episode of the task is cut off, where the user does not say."""
-        return HORIZON_S * self.fps
+        return _HORIZON_S * self.fps
 
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `gymnasium.make`."""
-        return {**super().gym_kwargs, "fps": self.fps}
+
+register(MetaworldSparseEnv, "metaworld:MetaworldSparse")

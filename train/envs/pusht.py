@@ -8,20 +8,17 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_cqn.errors import ConfigError
-
-from .common import checked_action
-from .pusht_config import FPS, KEYPOINTS, check_settings
+from .pusht_config import KEYPOINTS, PushtSmallEnv
+from .sim_env import Observation, SimEnv
+from .simulator import needed
 
 __all__ = ["PushT"]
 
 _WORLD = 512.0  # units a side
 _RENDER_SIZE = 384  # pixels a side of `render()`
 
-Observation = dict[str, Any]
 
-
-class PushT(gym.Env[Observation, NDArray[np.float32]]):
+class PushT(SimEnv):
     """A disc pushes a T onto a drawn one, at 10 Hz; physics, start and success are gym_pusht's own.
 
     Action, (2,) float32: the place the disc is sent to, x and y in 0 to 512, absolute. Values out of range are
@@ -43,56 +40,38 @@ class PushT(gym.Env[Observation, NDArray[np.float32]]):
     """
 
     action_kind: ClassVar[str] = "command"
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": FPS}
 
-    def __init__(
-        self,
-        obs_type: str = "pixels",
-        image_size: int = 96,
-        reward: str = "sparse",
-        render_mode: str | None = "rgb_array",
-    ) -> None:
-        """Build the scene.
+    def __init__(self, **settings: Any) -> None:
+        """Build the scene from fields of `PushtSmallEnv`.
 
         Raises:
-            ConfigError: an unknown obs_type or reward, a size out of range, or gym_pusht is missing.
+            ConfigError: a setting that `PushtSmallEnv` refuses, or gym_pusht is missing.
         """
-        check_settings(obs_type, image_size, reward)
+        config = PushtSmallEnv(**settings)
+        size = config.image_size
         self._simulator = _load()(
             obs_type="environment_state_agent_pos",
-            observation_width=image_size,
-            observation_height=image_size,
+            observation_width=size,
+            observation_height=size,
             visualization_width=_RENDER_SIZE,
             visualization_height=_RENDER_SIZE,
         )
-        self._with_state, self._with_picture = obs_type != "pixels", obs_type != "state"
-        self._dense = reward == "dense"
-        self.render_mode = render_mode
-        self.fps = FPS
-        self.task = "pusht"
+        # The disc may be sent beyond the walls, and the T is pushed through them now and then: no bounds.
+        super().__init__(config)
+        self._with_picture = config.obs_type != "state"
+        if self._with_picture:
+            self.observation_space.spaces["pixels"] = gym.spaces.Box(0, 255, (size, size, 3), np.uint8)
+        self._dense = config.reward == "dense"
         self.task_description = "Push the T-shaped block onto the T-shaped target."
         self.state_names = ["x", "y"]
         self.action_names = ["x", "y"]
         self.environment_state_names = [f"corner{i}.{axis}" for i in range(KEYPOINTS // 2) for axis in "xy"]
         self.action_space = gym.spaces.Box(0.0, _WORLD, (2,), np.float32)
-        # The disc may be sent beyond the walls, and the T is pushed through them now and then.
-        spaces: dict[str, gym.Space[Any]] = {"agent_pos": gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)}
-        if self._with_state:
-            spaces["environment_state"] = gym.spaces.Box(-np.inf, np.inf, (KEYPOINTS,), np.float32)
-        if self._with_picture:
-            spaces["pixels"] = gym.spaces.Box(0, 255, (image_size, image_size, 3), np.uint8)
-        self.observation_space = gym.spaces.Dict(spaces)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; the same `seed` gives gym_pusht's episode of that seed, without one the stream goes on.
-
-        `options` is accepted for callers that pass marks of their own; none changes anything.
-        """
-        super().reset(seed=seed)
+    def _begin(self, seed: int | None) -> Observation:
+        """Lay the scene out as gym_pusht does for the seed; without one the stream goes on."""
         observation, _ = self._simulator.reset(seed=seed)
-        return self._observe(observation), {"is_success": False}
+        return self._observe(observation)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Apply one action for 0.1 s.
@@ -100,7 +79,7 @@ class PushT(gym.Env[Observation, NDArray[np.float32]]):
         Raises:
             DataError: the action is not two finite numbers.
         """
-        checked = checked_action(action, self.action_space, self.action_names)
+        checked = self._checked(action)
         observation, coverage, _, _, info = self._simulator.step(checked)
         success = bool(info["is_success"])
         reward = float(coverage) if self._dense else float(success)
@@ -127,13 +106,7 @@ class PushT(gym.Env[Observation, NDArray[np.float32]]):
 def _load() -> Any:
     """gym_pusht's class. Raises ConfigError when it is not installed."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # it greets on stdout
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # pygame's, about how it looks for its own files
-            from gym_pusht.envs import PushTEnv
-    except ImportError as error:
-        raise ConfigError(
-            "The environment 'pusht_small' needs gym_pusht, which is not installed: "
-            "run `pip install 'lerobot_policy_cqn[pusht]'`."
-        ) from error
+    with needed("The environment 'pusht_small' needs gym_pusht", "pusht"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # pygame's, about how it looks for its own files
+        from gym_pusht.envs import PushTEnv
     return PushTEnv

@@ -1,35 +1,17 @@
-"""How LeRobot finds gym_pusht at the declared picture size: `--env.type=pusht_small`. Imports no simulator."""
+"""Settings of gym_pusht at the declared picture size, `--env.type=pusht_small`. No simulator is imported here."""
 
 from dataclasses import dataclass
-from typing import Any
 
-import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import OBS_IMAGE
 
-from lerobot_cqn.errors import ConfigError, one_of
+from .env_config import REWARDS, SimEnvConfig, Sizes, check_name, register
 
-from .env_config import SimEnvConfig, Sizes, check_cameras
+__all__ = ["KEYPOINTS", "PushtSmallEnv"]
 
-__all__ = ["FPS", "KEYPOINTS", "REWARDS", "PushtSmallEnv", "check_settings"]
-
-FPS = 10
 KEYPOINTS = 16  # numbers: x and y of eight corners
-LIMIT = 300  # steps, gym_pusht's own
-REWARDS = ("sparse", "dense")
-GYM_ID = "cqn_pusht/PushT-v0"
-
-if GYM_ID not in gym.registry:
-    # As text: the module is imported when an environment is made.
-    gym.register(GYM_ID, entry_point=f"{__package__}.pusht:PushT", max_episode_steps=LIMIT)
-
-
-def check_settings(obs_type: str, image_size: int, reward: str) -> None:
-    """Validate what a user may set. Raises ConfigError."""
-    check_cameras(obs_type, ("scene",), ("scene",), image_size)
-    if reward not in REWARDS:
-        raise ConfigError(one_of("reward", reward, REWARDS))
+_LIMIT = 300  # steps, gym_pusht's own
 
 
 @EnvConfig.register_subclass("pusht_small")
@@ -53,19 +35,21 @@ class PushtSmallEnv(SimEnvConfig):
         ConfigError: a value that is not one of those named above, or a given feature of another shape.
     """
 
+    gym_name = "cqn_pusht/PushT-v0"
+    tasks = ("pusht",)
+    rates = (10,)
+    rates_are = "gym_pusht's own"
+
     task: str | None = "pusht"  # the only one
-    fps: int = FPS  # gym_pusht's
+    fps: int = 10  # gym_pusht's
     obs_type: str = "pixels"  # state, pixels or both
     image_size: int = 96  # pixels a side; 96 in the public dataset
     reward: str = "sparse"  # 1 at success, or "dense": the covered share
 
     def check(self) -> None:
         """Validate what a user may set. Raises ConfigError."""
-        check_settings(self.obs_type, self.image_size, self.reward)
-        if self.task != "pusht":
-            raise ConfigError(one_of("task", str(self.task), ("pusht",)))
-        if self.fps != FPS:
-            raise ConfigError(f"fps is {self.fps}: expected {FPS}, gym_pusht's own.")
+        super().check()
+        check_name("reward", self.reward, REWARDS)
 
     @property
     def sizes(self) -> Sizes:
@@ -73,21 +57,8 @@ class PushtSmallEnv(SimEnvConfig):
         return Sizes(2, 2, 0 if self.obs_type == "pixels" else KEYPOINTS)
 
     @property
-    def gym_id(self) -> str:
-        """Name of the environment in gymnasium's registry."""
-        return GYM_ID
-
-    @property
     def usual_steps(self) -> int:
-        """Control steps before an episode of the task is cut off, where the user does not say."""
-        return LIMIT
-
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `gymnasium.make`."""
-        kwargs = super().gym_kwargs
-        del kwargs["cameras"]
-        return {**kwargs, "reward": self.reward}
+        return _LIMIT
 
     @property
     def shown_cameras(self) -> list[str]:
@@ -100,3 +71,6 @@ class PushtSmallEnv(SimEnvConfig):
             shape = (self.image_size, self.image_size, 3)
             derived[OBS_IMAGE] = (PolicyFeature(FeatureType.VISUAL, shape), OBS_IMAGE)
         return derived
+
+
+register(PushtSmallEnv, "pusht:PushT")

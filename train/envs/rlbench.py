@@ -11,51 +11,22 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_cqn.errors import ConfigError, DataError, one_of
+from lerobot_cqn.errors import ConfigError, DataError
 
-from .common import checked_action, dict_space
-from .env_config import check_cameras
-from .hil import preserved_numpy_random
+from .rlbench_config import CAMERAS, RLBenchEnv
+from .sim_env import Observation, SimEnv, preserved_numpy_random
 
-__all__ = ["CAMERAS", "FPS", "MAX_DELTA", "TASKS", "RLBenchGym", "check_settings"]
+__all__ = ["MAX_DELTA", "RLBenchGym"]
 
-FPS = 20  # one step of the simulator is 0.05 s
-CAMERAS = ("front", "wrist", "left_shoulder", "right_shoulder")
 MAX_DELTA = 0.5  # rad a step; far more than the arm can follow, to stop only wild actions
 _ALL_CAMERAS = (*CAMERAS, "overhead")
 _JOINTS = 7
 # As `cqn-data convert` names them in RLBench's own recordings.
 _NAMES = [*(f"joint_positions.{i}" for i in range(_JOINTS)), "gripper_open"]
 
-# The paper's 20 tasks and its limits in steps.
-TASKS = {
-    "take_lid_off_saucepan": 100,
-    "open_drawer": 100,
-    "stack_wine": 150,
-    "toilet_seat_up": 150,
-    "open_microwave": 125,
-    "open_oven": 225,
-    "take_plate_off_colored_dish_rack": 150,
-    "turn_tap": 125,
-    "put_money_in_safe": 150,
-    "phone_on_base": 175,
-    "put_books_on_bookshelf": 175,
-    "sweep_to_dustpan": 100,
-    "pick_up_cup": 100,
-    "open_door": 125,
-    "meat_on_grill": 150,
-    "basketball_in_hoop": 125,
-    "lamp_on": 100,
-    "press_switch": 100,
-    "put_rubbish_in_bin": 150,
-    "insert_usb_in_computer": 100,
-}
-
-Observation = dict[str, Any]
-
 
 class _Modules(NamedTuple):
-    """What is used of RLBench."""
+    """Parts of RLBench that are used."""
 
     tasks: Any
     environment: Any
@@ -66,7 +37,7 @@ class _Modules(NamedTuple):
     invalid_action: type[Exception]
 
 
-class RLBenchGym(gym.Env[Observation, NDArray[np.float32]]):
+class RLBenchGym(SimEnv):
     """A Franka Panda in CoppeliaSim, headless at 20 Hz; sparse reward. One of these a process.
 
     Action, (8,) float32: seven joint deltas in rad on the measured joints, within 0.5 rad, and the gripper, 0 (closed)
@@ -86,42 +57,29 @@ class RLBenchGym(gym.Env[Observation, NDArray[np.float32]]):
     """
 
     action_kind: ClassVar[str] = "command"
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": FPS}
 
-    def __init__(
-        self,
-        task: str = "take_lid_off_saucepan",
-        obs_type: str = "pixels",
-        cameras: list[str] | tuple[str, ...] = CAMERAS,
-        image_size: int = 84,
-        variation: int = 0,
-        render_mode: str | None = "rgb_array",
-    ) -> None:
-        """Start CoppeliaSim with the task's scene.
+    def __init__(self, **settings: Any) -> None:
+        """Start CoppeliaSim with the scene that fields of `RLBenchEnv` name.
 
         Raises:
-            ConfigError: an unknown task or camera, a number out of range, or RLBench, PyRep or CoppeliaSim is missing.
+            ConfigError: a setting that `RLBenchEnv` refuses, or RLBench, PyRep or CoppeliaSim is missing.
         """
-        check_settings(task, obs_type, cameras, image_size, variation)
+        config = RLBenchEnv(**settings)
         modules = _load()
+        super().__init__(config)
         self._invalid_action = modules.invalid_action
-        self._camera_names = tuple(cameras)
-        self.fps = FPS
-        self.render_mode = render_mode
-        self.task = task
-        self.task_description = task.replace("_", " ")
+        self.task_description = self.task.replace("_", " ")
         self.state_names = list(_NAMES)
         self.action_names = list(_NAMES)
         limits = np.array([MAX_DELTA] * _JOINTS + [1.0], np.float32)
         self.action_space = gym.spaces.Box(np.append(-limits[:_JOINTS], np.float32(0.0)), limits, dtype=np.float32)
-        self.observation_space = dict_space(len(_NAMES), 0, self._camera_names, image_size)
         self._last: Observation = {}
         self._simulator = modules.environment.Environment(
             action_mode=modules.action_mode.MoveArmThenGripper(
                 arm_action_mode=modules.arm.JointPosition(absolute_mode=False),
                 gripper_action_mode=modules.gripper.Discrete(),
             ),
-            obs_config=_wanted(modules, self._camera_names, image_size),
+            obs_config=_wanted(modules, self._camera_names, config.image_size),
             headless=True,
         )
         try:
@@ -130,24 +88,15 @@ class RLBenchGym(gym.Env[Observation, NDArray[np.float32]]):
             raise _missing(error) from error
         # CoppeliaSim crashes when the process ends before it does.
         self._closer = weakref.finalize(self, self._simulator.shutdown)
-        self._task = self._simulator.get_task(getattr(modules.tasks, _class_name(task)))
-        variations = int(self._task.variation_count())
+        self._task = self._simulator.get_task(getattr(modules.tasks, _class_name(self.task)))
+        variation, variations = config.variation, int(self._task.variation_count())
         if variation >= variations:
             self.close()
-            raise ConfigError(f"variation is {variation}: expected 0 to {variations - 1} for the task '{task}'.")
+            raise ConfigError(f"variation is {variation}: expected 0 to {variations - 1} for the task '{self.task}'.")
         self._task.set_variation(variation)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; the same `seed` places the objects alike, without one the random stream goes on.
-
-        `options` is accepted for callers that pass marks of their own; none changes anything.
-
-        Raises:
-            DataError: RLBench finds no place for the objects.
-        """
-        super().reset(seed=seed)
+    def _begin(self, seed: int | None) -> Observation:
+        """Place the objects. Raises DataError where RLBench finds no place for them."""
         try:
             # RLBench places objects with numpy's global state.
             with preserved_numpy_random(int(self.np_random.integers(2**32))):
@@ -159,7 +108,7 @@ class RLBenchGym(gym.Env[Observation, NDArray[np.float32]]):
             ) from error
         self.task_description = str(descriptions[0])
         self._last = self._observe(observation)
-        return self._last, {"is_success": False}
+        return self._last
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Apply one action for 0.05 s, and longer where the gripper opens or closes.
@@ -167,7 +116,7 @@ class RLBenchGym(gym.Env[Observation, NDArray[np.float32]]):
         Raises:
             DataError: the action is not eight finite numbers.
         """
-        checked = checked_action(action, self.action_space, self.action_names)
+        checked = self._checked(action)
         try:
             observation, reward, terminated = self._task.step(checked)
         except self._invalid_action:
@@ -177,7 +126,7 @@ class RLBenchGym(gym.Env[Observation, NDArray[np.float32]]):
         return self._last, float(success), bool(terminated) or success, False, {"is_success": success}
 
     def render(self) -> NDArray[np.uint8]:
-        """What the first camera saw last, (image_size, image_size, 3) uint8 RGB.
+        """Picture that the first camera saw last, (image_size, image_size, 3) uint8 RGB.
 
         Raises:
             DataError: no episode has begun.
@@ -195,23 +144,6 @@ class RLBenchGym(gym.Env[Observation, NDArray[np.float32]]):
         state = np.append(observation.joint_positions, observation.gripper_open).astype(np.float32)
         pixels = {name: np.asarray(getattr(observation, f"{name}_rgb"), np.uint8) for name in self._camera_names}
         return {"agent_pos": state, "pixels": pixels}
-
-
-def check_settings(
-    task: str, obs_type: str, cameras: list[str] | tuple[str, ...], image_size: int, variation: int
-) -> None:
-    """Validate what a user may set.
-
-    Raises:
-        ConfigError: an unknown task, obs_type or camera, none or a repeated camera, or a number out of range.
-    """
-    if task not in TASKS:
-        raise ConfigError(one_of("task", task, TASKS))
-    if obs_type != "pixels":
-        raise ConfigError(f"obs_type is '{obs_type}': expected 'pixels', RLBench's tasks share no state of objects.")
-    check_cameras(obs_type, cameras, CAMERAS, image_size)
-    if variation < 0:
-        raise ConfigError(f"variation is {variation}: expected 0 or more.")
 
 
 def _class_name(task: str) -> str:

@@ -1,31 +1,40 @@
-"""How LeRobot finds RLBench: `--env.type=rlbench`. Imports no simulator."""
+"""Settings of RLBench, `--env.type=rlbench`. No simulator is imported here."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
-import gymnasium as gym
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_cqn.errors import ConfigError
 
-from .env_config import SimEnvConfig, Sizes
-from .rlbench import CAMERAS, FPS, TASKS, RLBenchGym, check_settings
+from .env_config import SimEnvConfig, Sizes, register
 
-__all__ = ["RLBenchEnv"]
+__all__ = ["CAMERAS", "TASKS", "RLBenchEnv"]
 
+CAMERAS = ("front", "wrist", "left_shoulder", "right_shoulder")
 
-def _gym_id(task: str) -> str:
-    return f"cqn_rlbench/{task}-v0"
-
-
-for _name, _limit in TASKS.items():
-    if _gym_id(_name) not in gym.registry:
-        gym.register(
-            _gym_id(_name),
-            entry_point=f"{RLBenchGym.__module__}:{RLBenchGym.__qualname__}",
-            kwargs={"task": _name},
-            max_episode_steps=_limit,
-        )
+# The paper's 20 tasks and its limits in steps.
+TASKS = {
+    "take_lid_off_saucepan": 100,
+    "open_drawer": 100,
+    "stack_wine": 150,
+    "toilet_seat_up": 150,
+    "open_microwave": 125,
+    "open_oven": 225,
+    "take_plate_off_colored_dish_rack": 150,
+    "turn_tap": 125,
+    "put_money_in_safe": 150,
+    "phone_on_base": 175,
+    "put_books_on_bookshelf": 175,
+    "sweep_to_dustpan": 100,
+    "pick_up_cup": 100,
+    "open_door": 125,
+    "meat_on_grill": 150,
+    "basketball_in_hoop": 125,
+    "lamp_on": 100,
+    "press_switch": 100,
+    "put_rubbish_in_bin": 150,
+    "insert_usb_in_computer": 100,
+}
 
 
 @EnvConfig.register_subclass("rlbench")
@@ -49,17 +58,27 @@ class RLBenchEnv(SimEnvConfig):
         ConfigError: a value that is not one of those named above, or a given feature of another shape.
     """
 
+    gym_name = "cqn_rlbench/{task}-v0"
+    tasks = TASKS
+    known_cameras = CAMERAS
+    rates = (20,)
+    rates_are = "a step of RLBench's simulation is 0.05 s"
+
     task: str | None = "take_lid_off_saucepan"  # one of the paper's 20
-    fps: int = FPS  # RLBench's
+    fps: int = 20  # RLBench's
     variation: int = 0  # of the task
     obs_type: str = "pixels"  # the only one
     cameras: list[str] = field(default_factory=lambda: list(CAMERAS))  # front, wrist, shoulders
 
     def check(self) -> None:
         """Validate what a user may set. Raises ConfigError."""
-        check_settings(self.task or "", self.obs_type, self.cameras, self.image_size, self.variation)
-        if self.fps != FPS:
-            raise ConfigError(f"fps is {self.fps}: expected {FPS}, a step of RLBench's simulation is 0.05 s.")
+        if self.obs_type != "pixels":
+            raise ConfigError(
+                f"obs_type is '{self.obs_type}': expected 'pixels', RLBench's tasks share no state of objects."
+            )
+        super().check()
+        if self.variation < 0:
+            raise ConfigError(f"variation is {self.variation}: expected 0 or more.")
 
     @property
     def sizes(self) -> Sizes:
@@ -67,16 +86,8 @@ class RLBenchEnv(SimEnvConfig):
         return Sizes(8, 8, 0)
 
     @property
-    def gym_id(self) -> str:
-        """Name of the environment in gymnasium's registry."""
-        return _gym_id(str(self.task))
-
-    @property
     def usual_steps(self) -> int:
-        """Control steps before an episode of the task is cut off, where the user does not say."""
         return TASKS[str(self.task)]
 
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `gymnasium.make`."""
-        return {**super().gym_kwargs, "variation": self.variation}
+
+register(RLBenchEnv, "rlbench:RLBenchGym")

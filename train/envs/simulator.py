@@ -1,12 +1,33 @@
 """MuJoCo, imported on first use: the package itself stays importable without a simulator."""
 
+import contextlib
 import os
 import sys
+from collections.abc import Iterator
 from typing import Any
 
 from lerobot_cqn.errors import ConfigError
 
-__all__ = ["load_mujoco"]
+__all__ = ["load_mujoco", "needed"]
+
+
+@contextlib.contextmanager
+def needed(need: str, extra: str) -> Iterator[None]:
+    """Name the extra that is to be installed where an import inside fails.
+
+    Args:
+        need: what needs which package, as "The environment 'hil_sim' needs gym_hil".
+        extra: of this distribution.
+
+    Raises:
+        ConfigError: the package is not installed.
+    """
+    try:
+        yield
+    except (ImportError, ConfigError) as error:
+        raise ConfigError(
+            f"{need}, which is not installed: run `pip install 'lerobot_policy_cqn[{extra}]'`."
+        ) from error
 
 
 def load_mujoco() -> Any:
@@ -18,10 +39,6 @@ def load_mujoco() -> Any:
     if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
         # MuJoCo chooses its GL backend at import; without a screen its default would fail at the first frame.
         os.environ.setdefault("MUJOCO_GL", "egl")
-    try:
+    with needed("Simulated environments need mujoco", "sim"):
         import mujoco
-    except ImportError as error:
-        raise ConfigError(
-            "Simulated environments need mujoco, which is not installed: run `pip install 'lerobot_policy_cqn[sim]'`."
-        ) from error
     return mujoco

@@ -6,7 +6,7 @@ from lerobot.robots.config import RobotConfig
 
 from lerobot_cqn.errors import ConfigError, one_of
 
-from ..envs.ur5e_station.station import CAMERAS
+from ..envs.ur5e_station.config import CAMERAS
 from ..envs.ur5e_station.tasks import TASKS
 
 __all__ = ["FAULTS", "Fault", "SimUR5eConfig"]

@@ -100,7 +100,7 @@ class SimLeader(Teleoperator):
 
     def _meet(self) -> World:
         world = self._world = find_world(self.config.world)
-        self._person = ScriptedTeleoperator(world, self.config.pause_share, seed=self.config.seed)  # type: ignore[arg-type]
+        self._person = ScriptedTeleoperator(world, self.config.pause_share, seed=self.config.seed)
         self._joints, self._closure = world.arm.joints, world.arm.closure
         self._moved = self._since = world.now
         self._scene = world.scenes
@@ -128,7 +128,7 @@ class SimLeader(Teleoperator):
             largest = float(np.abs(way).max())
             limit = MAX_JOINT_SPEED / world.fps
             self._joints = self._joints + way * min(1.0, limit / max(largest, 1e-9))
-            self._closure = world.task.start_closure
+            self._closure = world.station_task.start_closure
             if world.scenes != self._scene:
                 self._scene = world.scenes
                 self._enter("wait", world)

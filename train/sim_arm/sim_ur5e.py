@@ -107,7 +107,7 @@ class SimUR5e(Robot):
                 world.catch_up()
             joints = to_robot_units(world.arm.joints, world.arm.closure)
             if self.config.state:
-                state = world.task.state(world.arm)
+                state = world.station_task.state(world.arm)
                 joints |= {n: float(v) for n, v in zip(self._object_names(), state, strict=True)}
             if self._on("frozen_joints"):
                 joints = {name: self._last.get(name, value) for name, value in joints.items()}

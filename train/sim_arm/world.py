@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +13,7 @@ from lerobot_cqn.errors import ConfigError, one_of
 
 from ..envs.cameras import Cameras
 from ..envs.ur5e_station.station import LEASH, MAX_JOINT_SPEED
+from ..envs.ur5e_station.task import Task
 from ..envs.ur5e_station.tasks import TASKS
 from ..envs.ur5e_station.ur5e import HOME, TIMESTEP, Arm
 
@@ -42,8 +42,8 @@ class World:
     A person lays the scene out anew whenever the arm, after it was away, rests at home.
 
     Attributes:
-        arm, task: of the station; fps: the leader's rate, 1/s of the simulated clock; action_space: deltas of a step
-            at that rate, and the gripper.
+        arm, station_task: of the station; fps: the leader's rate, 1/s of the simulated clock; action_space: deltas of
+            a step at that rate, and the gripper.
         now: simulated seconds since the start; scenes: how many have been laid out.
         fastest: highest joint speed so far, rad/s, and lowest, highest: joint angles so far, rad; measured in every
             physics step, to check safety limits against.
@@ -52,8 +52,8 @@ class World:
     fps = 10
 
     def __init__(self, task: str, speed: float, ramp_s: float, seed: int) -> None:
-        self.task = TASKS[task]()
-        self.arm = Arm(self.task.mjcf())
+        self.station_task: Task = TASKS[task]()
+        self.arm = Arm(self.station_task.mjcf())
         self._cameras = Cameras(self.arm.model)
         self._painter = ThreadPoolExecutor(1, "painter")  # a graphics context belongs to one thread; a robot to all
         self.lock = threading.RLock()
@@ -67,18 +67,11 @@ class World:
         self._clock = time.monotonic()
         self._left, self._rested = False, 0.0
         self._succeeded = False
-        self.arm.place(np.array(HOME), self.task.start_closure)
+        self.arm.place(np.array(HOME), self.station_task.start_closure)
         self.lowest, self.highest = np.array(HOME), np.array(HOME)
         self._start = self._reference = self._goal = np.array(HOME)
-        self._closure, self._since = self.task.start_closure, 0.0
+        self._closure, self._since = self.station_task.start_closure, 0.0
         self.lay_out()
-
-    # What `envs.expert.ScriptedTeleoperator` steers by; it was written for the environment.
-
-    @property
-    def station_task(self) -> Any:
-        """The running task."""
-        return self.task
 
     @property
     def success(self) -> bool:
@@ -109,7 +102,7 @@ class World:
         with self.lock:
             joints, closure = self.arm.joints, self.arm.closure
             self.arm.place(joints, closure)
-            self.task.reset(self.arm, self._rng)
+            self.station_task.reset(self.arm, self._rng)
             self.arm.forward()
             self._start = self._reference = self._goal = joints
             self._closure = closure
@@ -160,7 +153,7 @@ class World:
         joints = self.arm.joints
         self.fastest = max(self.fastest, float(np.abs(self.arm.joint_speeds).max()))
         self.lowest, self.highest = np.minimum(self.lowest, joints), np.maximum(self.highest, joints)
-        self._succeeded = self._succeeded or self.task.success(self.arm)
+        self._succeeded = self._succeeded or self.station_task.success(self.arm)
         away = float(np.abs(joints - HOME).max())
         self._left = self._left or away > _MOVED
         self._rested = self._rested + TIMESTEP if away < _AT_HOME else 0.0

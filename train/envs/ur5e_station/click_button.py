@@ -1,14 +1,10 @@
 """Click a button with the closed gripper; the button stands anywhere within 38 x 38 cm."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from .task import Goal, Task
-
-if TYPE_CHECKING:
-    from .ur5e import Arm
+from .ur5e import Arm
 
 __all__ = ["ClickButton"]
 
@@ -51,21 +47,21 @@ class ClickButton(Task):
           </body>
         </worldbody>"""
 
-    def reset(self, arm: "Arm", rng: np.random.Generator) -> None:
+    def reset(self, arm: Arm, rng: np.random.Generator) -> None:
         """The box is placed uniformly in the 38 x 38 cm square."""
         arm.model.body("button").pos[:2] = _CENTRE + rng.uniform(-_HALF_RANGE, _HALF_RANGE, 2)
 
-    def state(self, arm: "Arm") -> Array:
+    def state(self, arm: Arm) -> Array:
         """Top of the plunger, (3,) m; the policy has to find the way there from its joints."""
         return _top(arm)
 
-    def success(self, arm: "Arm") -> bool:
+    def success(self, arm: Arm) -> bool:
         """The plunger is 1 cm down, and it is the closed fingertips that push it."""
         pressed = bool(arm.data.joint("plunger").qpos[0] >= _PRESSED)
         # A forearm swept over the table can hit the button too; that is not the task.
         return pressed and arm.closure > 0.5 and float(np.linalg.norm(_top(arm) - arm.tip)) < _AT_BUTTON
 
-    def goal(self, arm: "Arm") -> Goal:
+    def goal(self, arm: Arm) -> Goal:
         """Towards a point above the button that sinks as the tip lines up: one smooth funnel, no phases."""
         button, tip = _top(arm), arm.tip
         aside = float(np.linalg.norm(button[:2] - tip[:2]))
@@ -86,5 +82,5 @@ class ClickButton(Task):
         )
 
 
-def _top(arm: "Arm") -> Array:
+def _top(arm: Arm) -> Array:
     return np.array(arm.data.site("button").xpos)

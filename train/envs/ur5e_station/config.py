@@ -1,31 +1,15 @@
-"""How LeRobot finds the station: `--env.type=ur5e_station`. Nothing here imports a simulator."""
+"""Settings of the station, `--env.type=ur5e_station`. No simulator is imported here."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
-import gymnasium as gym
 from lerobot.envs.configs import EnvConfig
 
-from ..env_config import SimEnvConfig, Sizes
-from .station import CAMERAS, UR5eStation, check_settings
+from ..env_config import SimEnvConfig, Sizes, register
 from .tasks import TASKS
 
-__all__ = ["UR5eStationEnv", "gym_id"]
+__all__ = ["CAMERAS", "UR5eStationEnv"]
 
-
-def gym_id(task: str) -> str:
-    """Name under which gymnasium knows a task of the station."""
-    return f"cqn_station/{task}-v0"
-
-
-for _name, _task in TASKS.items():
-    if gym_id(_name) not in gym.registry:
-        gym.register(
-            gym_id(_name),
-            entry_point=f"{UR5eStation.__module__}:{UR5eStation.__qualname__}",
-            kwargs={"task": _name},
-            max_episode_steps=_task.max_episode_steps,
-        )
+CAMERAS = ("left_shoulder", "right_shoulder", "upper_wrist", "lower_wrist")
 
 
 @EnvConfig.register_subclass("ur5e_station")
@@ -47,13 +31,15 @@ class UR5eStationEnv(SimEnvConfig):
         ConfigError: a value that is not one of those named above, or a given feature of another shape.
     """
 
+    gym_name = "cqn_station/{task}-v0"
+    tasks = TASKS
+    known_cameras = CAMERAS
+    rates = (5, 10, 20, 25, 50)
+    rates_are = "whole physics steps of 4 ms"
+
     task: str | None = "click_button"  # or take_lid_off_saucepan, flip_cup, open_drawer_put_teddy
     fps: int = 10  # control steps a second: 5, 10, 20, 25 or 50
     cameras: list[str] = field(default_factory=lambda: list(CAMERAS))  # left/right_shoulder, upper/lower_wrist
-
-    def check(self) -> None:
-        """Validate what a user may set. Raises ConfigError."""
-        check_settings(self.task or "", self.obs_type, self.cameras, self.image_size, self.fps)
 
     @property
     def sizes(self) -> Sizes:
@@ -61,16 +47,8 @@ class UR5eStationEnv(SimEnvConfig):
         return Sizes(7, 7, 0 if self.obs_type == "pixels" else len(TASKS[str(self.task)].state_names))
 
     @property
-    def gym_id(self) -> str:
-        """Name of the environment in gymnasium's registry."""
-        return gym_id(str(self.task))
-
-    @property
     def usual_steps(self) -> int:
-        """Control steps before an episode of the task is cut off, where the user does not say."""
         return TASKS[str(self.task)].max_episode_steps * self.fps // 10
 
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `gymnasium.make`."""
-        return {**super().gym_kwargs, "fps": self.fps}
+
+register(UR5eStationEnv, "ur5e_station.station:UR5eStation")

@@ -1,15 +1,11 @@
 """Stand a lying wine glass up by its stem; it lies anywhere within 15 x 30 cm."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from .grasp import SPEED, grasp
 from .task import Goal, Task
-
-if TYPE_CHECKING:
-    from .ur5e import Arm
+from .ur5e import Arm
 
 __all__ = ["FlipCup"]
 
@@ -65,21 +61,21 @@ class FlipCup(Task):
           </body>
         </worldbody>"""
 
-    def reset(self, arm: "Arm", rng: np.random.Generator) -> None:
+    def reset(self, arm: Arm, rng: np.random.Generator) -> None:
         """The glass lies with its brim towards the arm; its stem is uniformly in a rectangle of 15 x 30 cm."""
         place = _CENTRE + rng.uniform(-_HALF_RANGE, _HALF_RANGE)
         arm.data.joint("glass").qpos[:2] = place + np.array([_GRIP, 0.0])
 
-    def state(self, arm: "Arm") -> Array:
+    def state(self, arm: Arm) -> Array:
         """Place to grasp on the stem, (3,) m, and direction from foot to brim, (3,) of length 1."""
         return np.concatenate([_stem(arm), _axis(arm)])
 
-    def success(self, arm: "Arm") -> bool:
+    def success(self, arm: Arm) -> bool:
         """The axis is within 6 degrees of upright and the foot is on the table."""
         foot = _stem(arm)[2] - _GRIP * _axis(arm)[2]
         return bool(_axis(arm)[2] > _UPRIGHT and foot < _STANDING)
 
-    def goal(self, arm: "Arm") -> Goal:
+    def goal(self, arm: Arm) -> Goal:
         """Grasp the stem from above, turn in the air by what the glass lacks, and set it down."""
         stem, axis, pointing = _stem(arm), _axis(arm), arm.tip_rotation[:, 2]
         if not (arm.closure > _HELD and float(np.linalg.norm(stem + _PAST * pointing - arm.tip)) < 0.03):
@@ -101,9 +97,9 @@ class FlipCup(Task):
         )
 
 
-def _stem(arm: "Arm") -> Array:
+def _stem(arm: Arm) -> Array:
     return np.array(arm.data.site("stem").xpos)
 
 
-def _axis(arm: "Arm") -> Array:
+def _axis(arm: Arm) -> Array:
     return np.array(arm.data.site("stem").xmat[[2, 5, 8]])

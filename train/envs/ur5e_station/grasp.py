@@ -1,14 +1,10 @@
 """Moves that tasks share: going down on a point from above, and closing the fingers around something."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from .task import Goal
-
-if TYPE_CHECKING:
-    from .ur5e import Arm
+from .ur5e import Arm
 
 __all__ = ["SPEED", "funnel", "grasp"]
 
@@ -28,7 +24,7 @@ def funnel(aside: float, hover: float) -> float:
     return float(np.clip(_STEEP * (aside - _ALIGNED) / hover, 0.0, 1.0)) * hover
 
 
-def grasp(arm: "Arm", point: Array, hover: float, yaw: float = 0.0, pitch: float = 0.0, moment: int = 1) -> Goal:
+def grasp(arm: Arm, point: Array, hover: float, yaw: float = 0.0, pitch: float = 0.0, moment: int = 1) -> Goal:
     """Open the fingers, go down around `point` from above, close; what follows starts when they are closed.
 
     Args:

@@ -1,15 +1,11 @@
 """Open a drawer by its handle and put a teddy into it; the teddy lies anywhere within a circle of 10 cm radius."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from .grasp import SPEED, funnel, grasp
 from .task import Goal, Task
-
-if TYPE_CHECKING:
-    from .ur5e import Arm
+from .ur5e import Arm
 
 __all__ = ["OpenDrawerPutTeddy"]
 
@@ -90,23 +86,23 @@ class OpenDrawerPutTeddy(Task):
           </body>
         </worldbody>"""
 
-    def reset(self, arm: "Arm", rng: np.random.Generator) -> None:
+    def reset(self, arm: Arm, rng: np.random.Generator) -> None:
         """The teddy is placed uniformly in the circle; the drawer is 2 cm open."""
         angle, radius = rng.uniform(-np.pi, np.pi), _TEDDY_RADIUS * np.sqrt(rng.uniform())
         arm.data.joint("teddy").qpos[:2] = _TEDDY_CENTRE + radius * np.array([np.cos(angle), np.sin(angle)])
         arm.data.joint("drawer").qpos[0] = _AJAR
 
-    def state(self, arm: "Arm") -> Array:
-        """How far the drawer is open, m, and the teddy's middle, (3,) m."""
+    def state(self, arm: Arm) -> Array:
+        """Opening of the drawer, m, and the teddy's middle, (3,) m."""
         return np.append(_opening(arm), _teddy(arm))
 
-    def success(self, arm: "Arm") -> bool:
+    def success(self, arm: Arm) -> bool:
         """The drawer is open by 16 of its 18 cm, and the teddy is below its brim between its walls."""
         ahead, aside = (_teddy(arm)[:2] - _FRONT) + np.array([_opening(arm), 0.0])
         inside = 0.0 < ahead < _DEPTH and abs(aside) < _HALF_WIDTH and _teddy(arm)[2] < _INSIDE
         return bool(_opening(arm) > _OPEN and inside)
 
-    def goal(self, arm: "Arm") -> Goal:
+    def goal(self, arm: Arm) -> Goal:
         """Hook the handle with closed fingers and pull; grasp the teddy; carry it over the drawer; let go."""
         tip, teddy = arm.tip, _teddy(arm)
         if _opening(arm) < _PULLED:
@@ -120,7 +116,7 @@ class OpenDrawerPutTeddy(Task):
         return grasp(arm, teddy - np.array([0.0, 0.0, _PAST]), hover=0.10, moment=2)
 
 
-def _pull(arm: "Arm") -> Goal:
+def _pull(arm: Arm) -> Goal:
     hook, tip = np.array(arm.data.site("hook").xpos), arm.tip
     aside = float(np.linalg.norm(hook[:2] - tip[:2]))
     if aside < 0.03 and tip[2] < hook[2] + 0.015:
@@ -129,7 +125,7 @@ def _pull(arm: "Arm") -> Goal:
     return Goal(tip=hook + above, closure=1.0, speed=SPEED if aside > 0.03 else 0.15, hesitate=int(aside < 0.03))
 
 
-def _carry(arm: "Arm") -> Goal:
+def _carry(arm: Arm) -> Goal:
     inside, tip = np.array(arm.data.site("inside").xpos), arm.tip
     aside = float(np.linalg.norm(inside[:2] - tip[:2]))
     if aside < 0.02 and tip[2] < inside[2] + 0.02:
@@ -141,9 +137,9 @@ def _carry(arm: "Arm") -> Goal:
     return Goal(tip=high, closure=1.0, speed=SPEED, hesitate=3 if aside < 0.04 else 2)
 
 
-def _opening(arm: "Arm") -> float:
+def _opening(arm: Arm) -> float:
     return float(arm.data.joint("drawer").qpos[0])
 
 
-def _teddy(arm: "Arm") -> Array:
+def _teddy(arm: Arm) -> Array:
     return np.array(arm.data.site("teddy").xpos)

@@ -1,15 +1,11 @@
 """Take the lid off a saucepan by its knob; the saucepan stands anywhere within 38 x 38 cm."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from .grasp import SPEED, grasp
 from .task import Goal, Task
-
-if TYPE_CHECKING:
-    from .ur5e import Arm
+from .ur5e import Arm
 
 __all__ = ["TakeLidOffSaucepan"]
 
@@ -66,21 +62,21 @@ class TakeLidOffSaucepan(Task):
           </body>
         </worldbody>"""
 
-    def reset(self, arm: "Arm", rng: np.random.Generator) -> None:
+    def reset(self, arm: Arm, rng: np.random.Generator) -> None:
         """Saucepan and lid are placed uniformly in the 38 x 38 cm square."""
         place = _CENTRE + rng.uniform(-_HALF_RANGE, _HALF_RANGE, 2)
         arm.model.body("saucepan").pos[:2] = place
         arm.data.joint("lid").qpos[:2] = place
 
-    def state(self, arm: "Arm") -> Array:
+    def state(self, arm: Arm) -> Array:
         """Middle of the lid's knob, (3,) m."""
         return _knob(arm)
 
-    def success(self, arm: "Arm") -> bool:
+    def success(self, arm: Arm) -> bool:
         """The lid is 8 cm above the rim: nothing but a lift brings it there."""
         return bool(_knob(arm)[2] - _KNOB > _RIM + _LIFTED)
 
-    def goal(self, arm: "Arm") -> Goal:
+    def goal(self, arm: Arm) -> Goal:
         """Down around the knob, close, and up."""
         point = _knob(arm) - np.array([0.0, 0.0, _BELOW_KNOB])
         held = arm.closure > _HELD and float(np.linalg.norm(point - arm.tip)) < 0.03
@@ -90,5 +86,5 @@ class TakeLidOffSaucepan(Task):
         return grasp(arm, point, hover=0.06)
 
 
-def _knob(arm: "Arm") -> Array:
+def _knob(arm: Arm) -> Array:
     return np.array(arm.data.site("knob").xpos)

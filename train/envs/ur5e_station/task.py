@@ -1,20 +1,19 @@
-"""What a task of the station is; each task is one file and one entry in `tasks.py`."""
+"""A task of the station; each is one file and one entry in `tasks.py`."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from .ur5e import Arm
+from .ur5e import Arm
 
 __all__ = ["Goal", "Task"]
 
 
 @dataclass(frozen=True)
 class Goal:
-    """Where a skilled operator would steer from the present state.
+    """Place that a skilled operator would steer to from the present state.
 
     Attributes:
         tip: fingertip position to move towards, (3,) m in the world.
@@ -52,18 +51,18 @@ class Task:
         """Objects of the task, as top-level MJCF sections."""
         raise NotImplementedError
 
-    def reset(self, arm: "Arm", rng: np.random.Generator) -> None:
+    def reset(self, arm: Arm, rng: np.random.Generator) -> None:
         """Place the objects at random; the arm is already placed."""
         raise NotImplementedError
 
-    def state(self, arm: "Arm") -> NDArray[np.float64]:
+    def state(self, arm: Arm) -> NDArray[np.float64]:
         """Simulator state of the objects, (len(state_names),)."""
         raise NotImplementedError
 
-    def success(self, arm: "Arm") -> bool:
+    def success(self, arm: Arm) -> bool:
         """Whether the task is done now."""
         raise NotImplementedError
 
-    def goal(self, arm: "Arm") -> Goal:
-        """Where to steer now; a function of the present state only, so that cloning it is well posed."""
+    def goal(self, arm: Arm) -> Goal:
+        """Place to steer to now; a function of the present state only, so that cloning it is well posed."""
         raise NotImplementedError
