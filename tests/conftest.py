@@ -49,7 +49,7 @@ if sys.platform == "linux" and not os.environ.get("DISPLAY") and not os.environ.
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Try a test again, at most twice, where a busy machine may be late: only what is marked `real_time` depends on it."""
+    """Try again, at most twice, what is marked `real_time`: on a busy machine it may be late."""
     for item in items:
         if (mark := item.get_closest_marker("real_time")) is not None:
             assert mark.kwargs.get("reason"), f"{item.nodeid}: say why it needs real time"

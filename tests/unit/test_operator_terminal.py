@@ -1,5 +1,7 @@
 """The session by single keys, in a terminal of the test's own."""
 
+import array
+import fcntl
 import io
 import os
 import subprocess
@@ -13,6 +15,8 @@ import pytest
 from cqn_train.operator.keys import TerminalKeys
 from cqn_train.operator.session import Event, Session, State
 
+from ..driven_clock import DrivenClock
+
 
 @pytest.fixture
 def terminal() -> Iterator[tuple[int, io.TextIOWrapper]]:
@@ -22,18 +26,25 @@ def terminal() -> Iterator[tuple[int, io.TextIOWrapper]]:
     os.close(ours)
 
 
-def until(what: object, seconds: float = 10) -> None:
+def until(what: object, seconds: float = 60) -> None:
     deadline = time.monotonic() + seconds
     while not what():
         assert time.monotonic() < deadline
         time.sleep(0.01)
 
 
+def is_read(stream: io.TextIOWrapper) -> bool:
+    """Whether every key that was pressed has been read."""
+    waiting = array.array("i", [0])
+    fcntl.ioctl(stream.fileno(), termios.FIONREAD, waiting)
+    return waiting[0] == 0
+
+
 def test_a_session_by_keys(terminal: tuple[int, io.TextIOWrapper]) -> None:
     ours, stream = terminal
-    session, out = Session(), io.StringIO()
+    session, out, clock = Session(), io.StringIO(), DrivenClock()
     before = termios.tcgetattr(stream.fileno())
-    with TerminalKeys(session, stream, out, poll_s=0.01):
+    with TerminalKeys(session, stream, out, poll_s=0.01, clock=clock):
         until(lambda: "space start" in out.getvalue())
         for key, state in [
             (b" ", State.RUNNING), (b"t", State.TEACHING), (b"T", State.RUNNING), (b" ", State.PAUSED),
@@ -41,8 +52,8 @@ def test_a_session_by_keys(terminal: tuple[int, io.TextIOWrapper]) -> None:
         ]:  # fmt: skip
             session._home = False
             os.write(ours, key)
-            until(lambda state=state: session.state is state)
-            time.sleep(0.75 if key == b"t" else 0.05)
+            until(lambda state=state: session.state is state and is_read(stream))
+            clock.now += 0.75  # pressed again, and not held down
         until(lambda: "run over" in out.getvalue())
     assert termios.tcgetattr(stream.fileno()) == before
     lines = out.getvalue().splitlines()
@@ -129,5 +140,5 @@ def test_ctrl_c_is_still_ctrl_c() -> None:
         os.close(theirs)
         assert b"[waiting]" in program.stderr.readline()
         os.write(ours, b"\x03")
-        assert program.wait(20) == 42
+        assert program.wait(60) == 42
     os.close(ours)
