@@ -4,12 +4,14 @@ All are environment variables, set before torch, LeRobot or MuJoCo is imported: 
 """
 
 import ctypes
+import functools
 import os
 import shutil
 import signal
 import sys
 import tempfile
 
+import draccus.wrappers.docstring
 import hypothesis
 import pytest
 
@@ -18,6 +20,9 @@ import pytest
 hypothesis.settings.register_profile("same", deadline=None, derandomize=True)
 hypothesis.settings.register_profile("random", deadline=None, print_blob=True)
 hypothesis.settings.load_profile(os.environ.get("CQN_EXAMPLES", "same"))
+
+# It reads the sources of all options at each parse, half a second; the tests parse hundreds of times.
+draccus.wrappers.docstring.get_attribute_docstring = functools.cache(draccus.wrappers.docstring.get_attribute_docstring)
 
 # Started in the background of a shell, this process and all it starts would ignore Ctrl-C, which tests press.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -26,7 +26,7 @@ from cqn_train.sim_arm.sim_ur5e import SimUR5e
 from cqn_train.sim_arm.world import WORLDS
 
 from ..driven_clock import DrivenClock
-from .arm_bench import FPS, HOME_DEG, RAMP_S, SPEED
+from .arm_bench import FPS, HOME_DEG, RAMP_S, SPEED, Display
 from .conftest import TINY_POLICY
 from .test_cqn_train import tables
 
@@ -123,28 +123,9 @@ class Hands:
     def drive(self, steps: int) -> None:
         """Let it go on for so many steps."""
         begun, soon = self.session.episode, self.clock.until
-        soon(lambda: self.env.display.now == begun)  # type: ignore[attr-defined]
+        soon(lambda: self.env.display.begun[-1:] == [begun])  # type: ignore[attr-defined]
         goal = self.env._steps + steps
         soon(lambda: self.leave.is_set() or self.env._steps >= goal)
-
-
-class Screen:
-    """In place of the page: which episode is on."""
-
-    now = -99
-
-    def show(self, _: Any) -> None:
-        """Nothing to see."""
-
-    def health(self, **_: Any) -> None:
-        """Nothing to see."""
-
-    def begin_episode(self, number: int) -> None:
-        """One begins."""
-        self.now = number
-
-    def end_episode(self, *_: Any) -> None:
-        """One is over."""
 
 
 def run(
@@ -160,7 +141,7 @@ def run(
         assert isinstance(trainer.env, ArmEnvironment)
         assert isinstance(trainer.person, Session)
         assert isinstance(trainer.clock, DrivenClock)
-        trainer.env.display = Screen()
+        trainer.env.display = Display()
         hands = Hands(trainer.person, trainer.env, plan, trainer.clock)
         prepare(trainer, hands)
         with hands:

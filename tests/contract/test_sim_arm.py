@@ -156,6 +156,7 @@ def test_wrong_settings(settings: dict[str, object], said: str) -> None:
     assert len(FAULTS) == 8
 
 
+@pytest.mark.real_time(reason="lerobot-record keeps its rate by the machine's own clock")
 def test_lerobot_record_mirrors_the_leader(tmp_path: Path) -> None:
     """As a person at the terminal: ends the episode when the task is done, and the reset when the arm is home."""
     root = record_demonstrations(tmp_path, "--robot.camera_names=[upper_wrist]", "--robot.state=true", episodes=3)
