@@ -11,6 +11,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import TracebackType
 
+from cqn_train.clock import Clock
+
+
+def until(clock: Clock, ready: Callable[[], object], seconds: float = 10.0) -> None:
+    """Let time pass until something is so; fails where it does not become so."""
+    end = clock.now + seconds
+    while not ready():
+        assert clock.now < end, "it did not happen"
+        clock.sleep(0.002)
+
 
 @dataclass(eq=False)
 class _Waiting:
@@ -47,13 +57,6 @@ class DrivenClock:
     def thread(self, run: Callable[[], object], name: str) -> threading.Thread:
         """A thread whose turn comes when another one hands on."""
         return _Thread(self, run, name)
-
-    def until(self, ready: Callable[[], object], seconds: float = 10.0) -> None:
-        """Let time pass until something is so; fails where it does not become so."""
-        end = self.now + seconds
-        while not ready():
-            assert self.now < end, "it did not happen"
-            self.sleep(0.002)
 
     def _stand_still(self, me: _Waiting) -> None:
         self._waiting.append(me)

@@ -15,6 +15,7 @@ from lerobot.robots import make_robot_from_config
 from numpy.typing import NDArray
 
 from cqn_train.arm.environment import ArmEnvironment
+from cqn_train.clock import Clock
 from cqn_train.envs.ur5e_station.ur5e import HOME
 from cqn_train.interfaces import Outcome
 from cqn_train.operator.session import Event, RefusedError, Session, State
@@ -26,7 +27,7 @@ from cqn_train.sim_arm import Fault, SimUR5eConfig
 from cqn_train.sim_arm.sim_ur5e import SimUR5e
 from cqn_train.sim_arm.world import World
 
-from ..driven_clock import DrivenClock
+from ..driven_clock import DrivenClock, until
 
 Array = NDArray[np.float64]
 FPS, SPEED = 40, 8.0  # control steps and simulated seconds, in a second of the clock
@@ -98,7 +99,7 @@ NAMES = (
 class Bench:
     """What a test looks at and acts through."""
 
-    clock: DrivenClock
+    clock: Clock
     env: ArmEnvironment
     session: Session
     robot: SimUR5e
@@ -160,7 +161,7 @@ class Bench:
 
     def soon(self, ready: Callable[[], Any], seconds: float = 10.0) -> None:
         """Let time pass until something is so; fails the test where it does not become so."""
-        self.clock.until(ready, seconds)
+        until(self.clock, ready, seconds)
 
     def is_state(self, *states: State) -> Callable[[], bool]:
         return lambda: self.session.state in states
@@ -201,11 +202,12 @@ def bench(
     cameras: tuple[str, ...] = (),
     faults: tuple[Fault, ...] = (),
     should_stop: Callable[[], bool] = lambda: False,
+    clock: Clock | None = None,
     **arm: Any,
 ) -> Iterator[Bench]:
-    """The arm connected and held at home, the session waiting."""
+    """The arm connected and held at home, the session waiting. clock: by which all live; None: one of their own."""
     settings = ArmSettings(**{"episode_s": 60.0, "stale_s": 0.3, "watchdog_s": 0.25, "home_speed": 0.5, **arm})
-    clock = DrivenClock()
+    clock = clock or DrivenClock()
     robot = make_robot_from_config(
         SimUR5eConfig(
             speed=SPEED,

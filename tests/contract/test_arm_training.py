@@ -25,7 +25,7 @@ from cqn_train.sim_arm import SimUR5eConfig
 from cqn_train.sim_arm.sim_ur5e import SimUR5e
 from cqn_train.sim_arm.world import WORLDS
 
-from ..driven_clock import DrivenClock
+from ..driven_clock import DrivenClock, until
 from .arm_bench import FPS, HOME_DEG, RAMP_S, SPEED, Display
 from .conftest import TINY_POLICY
 from .test_cqn_train import tables
@@ -109,7 +109,7 @@ class Hands:
             self.session.apply(Event.STOP)
 
     def _episode(self, label: Event) -> None:
-        session, soon = self.session, self.clock.until
+        session, soon = self.session, functools.partial(until, self.clock)
         soon(lambda: self.leave.is_set() or Event.START in session.allowed() or Event.READY in session.allowed())
         if session.state is State.RESETTING:
             session.apply(Event.READY)
@@ -122,7 +122,7 @@ class Hands:
 
     def drive(self, steps: int) -> None:
         """Let it go on for so many steps."""
-        begun, soon = self.session.episode, self.clock.until
+        begun, soon = self.session.episode, functools.partial(until, self.clock)
         soon(lambda: self.env.display.begun[-1:] == [begun])  # type: ignore[attr-defined]
         goal = self.env._steps + steps
         soon(lambda: self.leave.is_set() or self.env._steps >= goal)

@@ -6,7 +6,7 @@ import pytest
 
 from cqn_train.clock import REAL, Clock
 
-from ..driven_clock import DrivenClock
+from ..driven_clock import DrivenClock, until
 
 
 def test_time_passes_where_it_is_slept_on_and_nowhere_else() -> None:
@@ -66,7 +66,7 @@ def test_threads_that_wait_for_one_another_are_an_error_and_no_hanging_test() ->
     with pytest.raises(AssertionError, match="every thread waits"):
         clock.wait(threading.Event(), float("inf"))
     with pytest.raises(AssertionError, match="did not happen"):
-        clock.until(lambda: False)
+        until(clock, lambda: False)
 
 
 @pytest.mark.real_time(reason="the machine's own clock is what is tested")

@@ -1,7 +1,5 @@
 """The session by single keys, in a terminal of the test's own."""
 
-import array
-import fcntl
 import io
 import os
 import subprocess
@@ -33,15 +31,10 @@ def until(what: object, seconds: float = 60) -> None:
         time.sleep(0.01)
 
 
-def is_read(stream: io.TextIOWrapper) -> bool:
-    """Whether every key that was pressed has been read."""
-    waiting = array.array("i", [0])
-    fcntl.ioctl(stream.fileno(), termios.FIONREAD, waiting)
-    return waiting[0] == 0
-
-
-def test_a_session_by_keys(terminal: tuple[int, io.TextIOWrapper]) -> None:
+def test_a_session_by_keys(terminal: tuple[int, io.TextIOWrapper], monkeypatch: pytest.MonkeyPatch) -> None:
     ours, stream = terminal
+    pressed, seen, read = b"", bytearray(), os.read
+    monkeypatch.setattr(os, "read", lambda *of: (data := read(*of), seen.extend(data))[0])
     session, out, clock = Session(), io.StringIO(), DrivenClock()
     before = termios.tcgetattr(stream.fileno())
     with TerminalKeys(session, stream, out, poll_s=0.01, clock=clock):
@@ -51,8 +44,9 @@ def test_a_session_by_keys(terminal: tuple[int, io.TextIOWrapper]) -> None:
             (b"\x1b[A", State.PAUSED), (b"s", State.RESETTING), (b"r", State.WAITING), (b"\x1b", State.STOPPED),
         ]:  # fmt: skip
             session._home = False
+            pressed += key
             os.write(ours, key)
-            until(lambda state=state: session.state is state and is_read(stream))
+            until(lambda state=state, pressed=pressed: session.state is state and seen == pressed)
             clock.now += 0.75  # pressed again, and not held down
         until(lambda: "run over" in out.getvalue())
     assert termios.tcgetattr(stream.fileno()) == before

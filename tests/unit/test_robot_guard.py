@@ -14,7 +14,7 @@ from cqn_train.robot.guard import Guard, GuardSettings, RobotFault, StoppedError
 from cqn_train.robot.limits import Limits, allowed_goal
 from lerobot_cqn.errors import ConfigError
 
-from ..driven_clock import DrivenClock
+from ..driven_clock import DrivenClock, until
 
 D = 3
 NAMES = ("a.pos", "b.pos", "c.pos")
@@ -179,7 +179,7 @@ def test_stop_wins_over_a_goal_that_is_on_its_way() -> None:
     assert clock.wait(reached, 5)
     stopper = clock.thread(guard.stop, "stopper")
     stopper.start()
-    clock.until(lambda: guard.stopped)
+    until(clock, lambda: guard.stopped)
     go_on.set()
     sender.join(5)
     stopper.join(5)
