@@ -4,17 +4,25 @@ All are environment variables, set before torch, LeRobot or MuJoCo is imported: 
 """
 
 import ctypes
+import functools
 import os
 import shutil
 import signal
 import sys
 import tempfile
 
+import draccus.wrappers.docstring
 import hypothesis
 import pytest
 
-hypothesis.settings.register_profile("cqn", deadline=None)  # a busy machine is no failure
-hypothesis.settings.load_profile("cqn")
+# `make test` draws the same examples every time, `make slow` new ones, and says how to draw them again. No deadline:
+# a busy machine is no failure.
+hypothesis.settings.register_profile("same", deadline=None, derandomize=True)
+hypothesis.settings.register_profile("random", deadline=None, print_blob=True)
+hypothesis.settings.load_profile(os.environ.get("CQN_EXAMPLES", "same"))
+
+# It reads the sources of all options at each parse, half a second; the tests parse hundreds of times.
+draccus.wrappers.docstring.get_attribute_docstring = functools.cache(draccus.wrappers.docstring.get_attribute_docstring)
 
 # Started in the background of a shell, this process and all it starts would ignore Ctrl-C, which tests press.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -43,6 +51,14 @@ def _has_library(name: str) -> bool:
 if sys.platform == "linux" and not os.environ.get("DISPLAY") and not os.environ.get("MUJOCO_GL"):
     only_software = _has_library("libOSMesa.so.8") and not _has_library("libEGL.so.1")
     os.environ["MUJOCO_GL"] = "osmesa" if only_software else "egl"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Try again, at most twice, what is marked `real_time`: on a busy machine it may be late."""
+    for item in items:
+        if (mark := item.get_closest_marker("real_time")) is not None:
+            assert mark.kwargs.get("reason"), f"{item.nodeid}: say why it needs real time"
+            item.add_marker(pytest.mark.flaky(reruns=2))
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:

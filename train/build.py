@@ -21,6 +21,7 @@ from lerobot_cqn.learner import Learner
 
 from .agent import Agent
 from .arm.build import make_operated, recall, steering
+from .clock import REAL, Clock
 from .config import ValidRun
 from .interfaces import Environment, Monitor, Nobody, Person, Scenes
 from .loop.gym_env import GymEnvironment, GymScenes, OneScene, check_fits
@@ -55,10 +56,16 @@ class World:
     board: Board | None = None
 
 
-def build(run: ValidRun, monitor: Monitor, should_stop: Callable[[], bool], stack: contextlib.ExitStack) -> Trainer:
+def build(
+    run: ValidRun,
+    monitor: Monitor,
+    should_stop: Callable[[], bool],
+    stack: contextlib.ExitStack,
+    clock: Clock = REAL,
+) -> Trainer:
     """Every part of a run, put together. Raises CQNError before any work is done.
 
-    stack: takes up what must be closed again.
+    stack: takes up what must be closed again; clock: by which trainer and arm live.
     """
     config = run.config
     check_outside(run, monitor.message)
@@ -70,7 +77,7 @@ def build(run: ValidRun, monitor: Monitor, should_stop: Callable[[], bool], stac
     if isinstance(run.acts_in, EnvConfig):
         world = make_simulation(run.acts_in, run, checkpoint, data, stack)
     else:
-        world = make_arm(run.acts_in, run, checkpoint, data, monitor.message, should_stop, stack)
+        world = make_arm(run.acts_in, run, checkpoint, data, monitor.message, should_stop, stack, clock)
     agent, replay = world.agent, make_replay(run)
     with nothing_left(None if config.resume else run.output_dir):
         load_demonstrations(run, data, world, replay, monitor)
@@ -100,7 +107,7 @@ def build(run: ValidRun, monitor: Monitor, should_stop: Callable[[], bool], stac
     return Trainer(
         config=config, agent=agent, learner=learner, env=world.env, scenes=world.scenes, replay=replay,
         metrics=metrics, monitor=monitor, rng=rng, counters=counters, save=save_checkpoint, should_stop=should_stop,
-        finished_since=finished, person=world.person,
+        finished_since=finished, person=world.person, clock=clock,
     )  # fmt: skip
 
 
@@ -146,10 +153,11 @@ def make_arm(
     say: Callable[[str], None],
     should_stop: Callable[[], bool],
     stack: contextlib.ExitStack,
+    clock: Clock,
 ) -> World:
     """An arm with its person at the page or at keys; it is the only scene of evaluations, too."""
     agent = make_agent(run, checkpoint, data, None)
-    operated = make_operated(robot_config, run.config, agent, data, should_stop, say)
+    operated = make_operated(robot_config, run.config, agent, data, should_stop, say, clock)
     stack.enter_context(steering(run.config, operated, say))  # before anything is written: the port may be taken
     stack.callback(operated.env.close)
     stack.callback(lambda: say(operated.env.summary()) if operated.env.summary() else None)

@@ -37,7 +37,8 @@ FLOORS: dict[str, str] = {
     ),
     "datasets_tools": "terminal decisions views disk operations formats|inspection|hub record|cli",
     "train": (
-        "interfaces envs|robot|operator sim_arm|config agent replay run loop arm push|arguments build cli|bench|demo"
+        "interfaces|clock envs|robot|operator sim_arm|config agent replay run loop arm "
+        "push|arguments build cli|bench|demo"
     ),
 }
 

@@ -1,8 +1,10 @@
-"""An arm's environment over the simulated arm and a scripted person, without a page; judged in the simulator."""
+"""An arm's environment over the simulated arm and a scripted person, without a page; judged in the simulator.
+
+All of them, the attendant and the watchdog live by one clock, which is the bench's: see `driven_clock`.
+"""
 
 import contextlib
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,6 +15,7 @@ from lerobot.robots import make_robot_from_config
 from numpy.typing import NDArray
 
 from cqn_train.arm.environment import ArmEnvironment
+from cqn_train.clock import Clock
 from cqn_train.envs.ur5e_station.ur5e import HOME
 from cqn_train.interfaces import Outcome
 from cqn_train.operator.session import Event, RefusedError, Session, State
@@ -24,11 +27,14 @@ from cqn_train.sim_arm import Fault, SimUR5eConfig
 from cqn_train.sim_arm.sim_ur5e import SimUR5e
 from cqn_train.sim_arm.world import World
 
+from ..driven_clock import DrivenClock, until
+
 Array = NDArray[np.float64]
-FPS, SPEED = 40, 8.0  # control steps and simulated seconds, in a real second
+FPS, SPEED = 40, 8.0  # control steps and simulated seconds, in a second of the clock
 RAMP_S = SPEED / FPS  # a period of the simulated clock: the arm is led evenly from goal to goal
 HOME_DEG = np.append(np.degrees(HOME), 0.0)
 STEP_DEG = 2.0
+READ_S = 0.004  # that a reading takes: others run meanwhile, and find the guard busy
 # What the physics adds to the speed of the goals (a joint swings when it starts, and is led by a clock that is read a
 # little early or late); measured over runs without faults, with room.
 SWING = 1.6
@@ -89,18 +95,11 @@ NAMES = (
 )  # fmt: skip
 
 
-def soon(ready: Callable[[], Any], seconds: float = 10.0) -> None:
-    """Wait until something is so; fails the test where it does not become so."""
-    deadline = time.monotonic() + seconds
-    while not ready():
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.002)
-
-
 @dataclass
 class Bench:
     """What a test looks at and acts through."""
 
+    clock: Clock
     env: ArmEnvironment
     session: Session
     robot: SimUR5e
@@ -133,7 +132,7 @@ class Bench:
                 with contextlib.suppress(RefusedError):
                     self.session.apply(Event.STOP)
 
-        self._threads.append(threading.Thread(target=run, daemon=True))
+        self._threads.append(self.clock.thread(run, "person"))
         self._threads[-1].start()
 
     def do(self, *events: Event) -> None:
@@ -145,7 +144,7 @@ class Bench:
         """An episode begins, as the loop and the person begin it; returns its first frame."""
 
         def start() -> None:
-            soon(lambda: not self.session.busy)
+            self.soon(lambda: not self.session.busy)
             if self.session.state is State.RESETTING:
                 self.session.apply(Event.READY)
             self.session.apply(Event.START)
@@ -160,19 +159,23 @@ class Bench:
         goal[: len(move)] += move
         return self.env.step(torch.tensor(goal, dtype=torch.float32)[None])
 
+    def soon(self, ready: Callable[[], Any], seconds: float = 10.0) -> None:
+        """Let time pass until something is so; fails the test where it does not become so."""
+        until(self.clock, ready, seconds)
+
     def is_state(self, *states: State) -> Callable[[], bool]:
         return lambda: self.session.state in states
 
     def at_rest(self, seconds: float = 0.15) -> bool:
-        """Whether the arm does not move for so many real seconds (more than a simulated one)."""
+        """Whether the arm does not move for so many seconds (more than a simulated one)."""
         before = self.joints
-        time.sleep(seconds)
+        self.clock.sleep(seconds)
         return bool(np.abs(self.joints - before).max() < 0.3)
 
     def check(self, speed_deg: float = STEP_DEG * FPS, *, springs: bool = False) -> None:
         """The simulator saw no joint faster or farther than allowed, and no goal far from the arm.
 
-        speed_deg: degrees in a real second. springs: a joint came free, and went to its goal as fast as motors do:
+        speed_deg: degrees in a second. springs: a joint came free and went to its goal as fast as motors do:
         goals can keep that short, at a step, and not slow.
         """
         limits, world = self.env.arm.limits, self.world
@@ -199,10 +202,12 @@ def bench(
     cameras: tuple[str, ...] = (),
     faults: tuple[Fault, ...] = (),
     should_stop: Callable[[], bool] = lambda: False,
+    clock: Clock | None = None,
     **arm: Any,
 ) -> Iterator[Bench]:
-    """The arm connected and held at home, the session waiting."""
+    """The arm connected and held at home, the session waiting. clock: by which all live; None: one of their own."""
     settings = ArmSettings(**{"episode_s": 60.0, "stale_s": 0.3, "watchdog_s": 0.25, "home_speed": 0.5, **arm})
+    clock = clock or DrivenClock()
     robot = make_robot_from_config(
         SimUR5eConfig(
             speed=SPEED,
@@ -215,15 +220,20 @@ def bench(
         )
     )
     assert isinstance(robot, SimUR5e)
+    robot.clock = clock
     hand = HandLeader()
-    guard = Guard(robot, arm_limits(), GuardSettings(settings.stale_s, settings.watchdog_s, slow_s=0.4))
+    guard = Guard(robot, arm_limits(), GuardSettings(settings.stale_s, settings.watchdog_s, slow_s=0.4), clock)
     made = Arm(
         guard, settings, FPS, leader=hand, clutched=range(6), home=HOME_DEG  # type: ignore[arg-type]
     )  # fmt: skip
     session, display = Session(can_free=guard.can_release), Display()
-    env = ArmEnvironment(made, session, display, should_stop)
-    made_bench = Bench(env, session, robot, hand, display)
-    send = robot.send_action
+    env = ArmEnvironment(made, session, display, should_stop, clock)
+    made_bench = Bench(clock, env, session, robot, hand, display)
+    read, send = robot.get_observation, robot.send_action
+
+    def slowly() -> dict[str, Any]:
+        clock.sleep(READ_S)
+        return read()
 
     def spy(action: dict[str, Any]) -> dict[str, Any]:
         sent = send(action)
@@ -232,6 +242,7 @@ def bench(
         made_bench.farthest = max(made_bench.farthest, float(away))
         return sent
 
+    robot.get_observation = slowly  # type: ignore[method-assign]
     robot.send_action = spy  # type: ignore[method-assign]
     hand.pose = HOME_DEG.copy
     env.open()

@@ -3,7 +3,6 @@
 import logging
 import os
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from cqn_train.cli import main as cqn_train
 
 from ..toy_datasets import make_dataset
 from .data_recording import make_recording
+from .zygote import Zygote, zygote
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -29,15 +29,28 @@ TINY_RUN = [
 ]  # fmt: skip
 
 
+# What every command imports, of ours nothing: that LeRobot finds the policy by itself is part of what is tested.
+PRELOAD = (
+    "torch._dynamo, lerobot.scripts.lerobot_train, lerobot.scripts.lerobot_edit_dataset, mujoco, matplotlib.pyplot"
+)
+
+
 @pytest.fixture(scope="session")
-def command() -> Command:
+def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Zygote]:
+    """Starts installed commands without importing LeRobot each time."""
+    with zygote(tmp_path_factory.mktemp("zygote") / "log", PRELOAD) as started:
+        yield started
+
+
+@pytest.fixture(scope="session")
+def command(processes: Zygote, tmp_path_factory: pytest.TempPathFactory) -> Command:
     """Run an installed command with the given arguments; fails the test unless the exit code is the expected one."""
 
     def run(name: str, *arguments: str, code: int = 0) -> subprocess.CompletedProcess[str]:
-        done = subprocess.run(
-            [str(Path(sys.executable).parent / name), *arguments],
-            capture_output=True, text=True, timeout=180, check=False, env=dict(os.environ),
-        )  # fmt: skip
+        out, err = (tmp_path_factory.mktemp("said") / kind for kind in ("out", "err"))
+        number = processes.start(name, *arguments, out=str(out), err=str(err))
+        returned = os.waitstatus_to_exitcode(processes.wait(number, 180))
+        done = subprocess.CompletedProcess([name, *arguments], returned, out.read_text(), err.read_text())
         assert done.returncode == code, done.stderr[-3000:]
         return done
 

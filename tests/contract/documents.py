@@ -86,7 +86,7 @@ def commands(page: Path, folder: Path) -> list[Command]:
     written.touch()
     done = subprocess.run(
         [shell, "-u", "-c", "\n".join(script)], cwd=folder, env={"PATH": "/nowhere", "COMMANDS": str(written)},
-        capture_output=True, text=True, timeout=20, check=False,
+        capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     assert "syntax error" not in done.stderr, done.stderr
     assert "unbound variable" not in done.stderr, done.stderr

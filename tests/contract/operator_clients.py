@@ -19,18 +19,11 @@ from websockets.sync.client import connect
 from cqn_train.operator.control import Control
 from cqn_train.operator.page.server import OperatorServer, make_app
 
+from ..driven_clock import DrivenClock
+
 TOKEN = "a-token-of-the-test"  # noqa: S105
 ANN = {"X-Token": TOKEN, "X-Client": "ann"}
 BOB = {"X-Token": TOKEN, "X-Client": "bob"}
-
-
-class Clock:
-    """Seconds that pass when told to."""
-
-    now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 @pytest.fixture(name="board")
@@ -41,18 +34,19 @@ def board_fixture() -> Board:
 
 
 @pytest.fixture(name="clock")
-def clock_fixture() -> Clock:
-    return Clock()
+def clock_fixture() -> DrivenClock:
+    return DrivenClock()
 
 
 @pytest.fixture(name="client")
-def client_fixture(board: Board, clock: Clock) -> Iterator[TestClient]:
+def client_fixture(board: Board, clock: DrivenClock) -> Iterator[TestClient]:
     control = Control(board.session, 10.0, said=board.message, clock=clock)
     with TestClient(make_app(board, TOKEN, control, check_s=0.01), base_url="http://127.0.0.1:8000") as client:
         yield client
 
 
-def until(what: Callable[[], Any], seconds: float = 10) -> None:
+def until(what: Callable[[], Any], seconds: float = 60) -> None:
+    """Wait for what another thread brings about; however busy the machine."""
     deadline = time.monotonic() + seconds
     while not what():
         assert time.monotonic() < deadline
@@ -60,10 +54,12 @@ def until(what: Callable[[], Any], seconds: float = 10) -> None:
 
 
 @pytest.fixture(name="server")
-def server_fixture(board: Board) -> Iterator[OperatorServer]:
-    with OperatorServer(board, absent_s=1.0) as server:
+def server_fixture(board: Board, clock: DrivenClock) -> Iterator[OperatorServer]:
+    with OperatorServer(board, absent_s=1.0, clock=clock) as server:
         yield server
 
 
 def page_of(server: OperatorServer, client: str) -> Any:
-    return connect(f"ws://127.0.0.1:{server.port}/ws?token={server.token}&client={client}", max_queue=None)
+    return connect(
+        f"ws://127.0.0.1:{server.port}/ws?token={server.token}&client={client}", max_queue=None, open_timeout=60
+    )

@@ -23,5 +23,5 @@ def record_demonstrations(folder: Path, *robot: str, episodes: int) -> Path:
         ],
         folder,
     )  # fmt: skip
-    assert terminal.run(RECORD_KEYS, 150) == 0, terminal.said[-3000:]
+    assert terminal.run(RECORD_KEYS, 300) == 0, terminal.said[-3000:]
     return root

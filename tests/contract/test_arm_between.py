@@ -8,7 +8,7 @@ import pytest
 
 from cqn_train.operator.session import Event, State
 
-from .arm_bench import FPS, HOME_DEG, STEP_DEG, SWING_DEG, Bench, bench, soon
+from .arm_bench import FPS, HOME_DEG, STEP_DEG, SWING_DEG, Bench, bench
 
 pytest.importorskip("mujoco")
 
@@ -26,10 +26,10 @@ def test_between_episodes_it_goes_home_slowly(arm: Bench) -> None:
     arm.do(Event.FAILURE)
     arm.step()
     arm.world.fastest = 0.0
-    soon(lambda: np.abs(arm.joints - HOME_DEG[:6]).max() < 4)  # then the simulator lays out the scene: a small jerk
+    arm.soon(lambda: np.abs(arm.joints - HOME_DEG[:6]).max() < 4)  # then the simulator lays out the scene: a small jerk
     arm.check(speed_deg=0.5 * STEP_DEG * FPS)  # `home_speed`
-    soon(lambda: np.abs(arm.joints - HOME_DEG[:6]).max() < 0.5)
-    soon(lambda: arm.at_rest(0.05))
+    arm.soon(lambda: np.abs(arm.joints - HOME_DEG[:6]).max() < 0.5)
+    arm.soon(lambda: arm.at_rest(0.05))
     assert np.abs(arm.joints - HOME_DEG[:6]).max() < SWING_DEG
     assert arm.session.state is State.RESETTING  # a person says when the scene is ready
 
@@ -42,7 +42,7 @@ def test_a_start_on_the_way_home_begins_where_the_arm_is(arm: Bench) -> None:
     arm.step()
     away = arm.joints
     arm.session.learning("")
-    soon(lambda: np.abs(arm.joints - away).max() > 2)
+    arm.soon(lambda: np.abs(arm.joints - away).max() > 2)
     arm.begin()
     here = arm.joints
     assert np.abs(here - HOME_DEG[:6]).max() > 3
@@ -65,15 +65,15 @@ def test_an_arm_on_its_way_home_can_be_taken_by_hand(arm: Bench) -> None:
     arm.do(Event.SUCCESS)
     arm.step()
     away = arm.joints
-    soon(lambda: np.abs(arm.joints - away).max() > 2)
+    arm.soon(lambda: np.abs(arm.joints - away).max() > 2)
     arm.do(Event.FREE)
-    soon(lambda: torque == [False], 0.3)
+    arm.soon(lambda: torque == [False], 0.3)
     sent = len(arm.goals)
-    soon(arm.at_rest)
+    arm.soon(arm.at_rest)
     assert np.abs(arm.joints - HOME_DEG[:6]).max() > 3
     assert len(arm.goals) == sent
     arm.do(Event.FREE)
-    soon(lambda: torque == [False, True], 0.3)
+    arm.soon(lambda: torque == [False, True], 0.3)
     place = arm.joints
     assert arm.at_rest(0.3)
     assert np.abs(arm.goals[-1][:6] - place).max() < 0.5
@@ -87,8 +87,8 @@ def test_home_is_asked_for_at_the_page(arm: Bench) -> None:
         arm.step(15)
     arm.do(Event.SUCCESS)
     arm.step()
-    soon(arm.at_rest)
+    arm.soon(arm.at_rest)
     assert np.abs(arm.joints - HOME_DEG[:6]).max() > 5
     arm.do(Event.HOME)
-    soon(lambda: np.abs(arm.joints - HOME_DEG[:6]).max() < 0.5)
+    arm.soon(lambda: np.abs(arm.joints - HOME_DEG[:6]).max() < 0.5)
     arm.check()

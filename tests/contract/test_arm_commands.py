@@ -1,11 +1,10 @@
 """From a person's demonstrations to an arm that a policy drives, with LeRobot's own commands at both ends."""
 
+import contextlib
 import csv
 import json
 import socket
-import subprocess
-import sys
-import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from cqn_train.replay.files import Journal
 
 from .conftest import TINY_POLICY, Command
 from .terminal import record_demonstrations
+from .zygote import Zygote, wait_until
 
 pytest.importorskip("mujoco")
 CAMERA = ["--robot.camera_names=[upper_wrist]", "--robot.image_height=96", "--robot.image_width=128"]
@@ -38,6 +38,7 @@ def demonstrations(command: Command, tmp_path_factory: pytest.TempPathFactory) -
     return folder / "cqn"
 
 
+@pytest.mark.real_time(reason="lerobot-rollout drives the simulated arm for three seconds of the machine's own clock")
 @pytest.mark.parametrize(("trained", "robot"), [(STATE_ONLY, BLIND), (SMALL_EYES, CAMERA)], ids=["state", "camera"])
 def test_rollout_sends_absolute_goals(
     trained: list[str], robot: list[str], demonstrations: Path, command: Command, tmp_path: Path
@@ -71,10 +72,13 @@ def test_rollout_sends_absolute_goals(
     assert np.ptp(measured[:, JOINTS], axis=0).max() > 0.5  # it moved
 
 
-def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
+@pytest.fixture
+def port() -> Iterator[int]:
+    """A free port that nobody else is given meanwhile: it is bound here, and a server may listen on it all the same."""
+    with socket.socket() as ours:
+        ours.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        ours.bind(("127.0.0.1", 0))
+        yield ours.getsockname()[1]
 
 
 def rows(run: Path, table: str) -> list[dict[str, str]]:
@@ -82,12 +86,14 @@ def rows(run: Path, table: str) -> list[dict[str, str]]:
     return list(csv.DictReader(path.open())) if path.exists() else []
 
 
+@pytest.mark.real_time(reason="the arm and the person of another process live by the machine's own clock")
 def test_online_with_a_person_killed_and_resumed(
-    demonstrations: Path, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    demonstrations: Path, command: Command, processes: Zygote, port: int, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     """A simulated person at the page starts, takes over and labels; a kill loses no finished episode."""
     monkeypatch.setenv("CQN_PAGE_TOKEN", "a-token-of-the-test")
-    run, port = tmp_path / "run", free_port()
+    run, log = tmp_path / "run", tmp_path / "log.txt"
     arguments = [
         *TINY_POLICY, *SMALL_EYES, *CAMERA, "--robot.type=sim_ur5e", "--robot.state=true", "--robot.speed=4",
         f"--robot.person=http://127.0.0.1:{port}", "--robot.person_takes_over_s=2", "--teleop.type=sim_leader",
@@ -95,15 +101,12 @@ def test_online_with_a_person_killed_and_resumed(
         "--offline_updates=2", "--updates_per_episode=2", "--batch_size=4", "--demo_batch_size=4", "--steps=100000",
         "--arm.episode_s=2.5", "--save_freq=40", "--log_freq=1", "--threads=1", f"--output_dir={run}",
     ]  # fmt: skip
-    with (tmp_path / "log.txt").open("wb") as log:
-        process = subprocess.Popen([sys.executable, "-m", "cqn_train.cli", *arguments], stdout=log, stderr=log)
-        deadline = time.monotonic() + 120
-        while len(rows(run, "episodes")) < 3 and process.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.1)
-        process.kill()
-        process.wait()
+    process = processes.start("cqn-train", *arguments, err=str(log))
+    with contextlib.suppress(AssertionError):  # said below, with the reason
+        wait_until(lambda: len(rows(run, "episodes")) >= 3)
+    processes.kill(process)
     before = rows(run, "episodes")
-    assert len(before) >= 3, (tmp_path / "log.txt").read_text()[-2000:]
+    assert len(before) >= 3, log.read_text()[-2000:]
     assert any(int(row["taught"]) > 0 and row["success"] == "1" for row in before)
     places = [place for _, place in Journal(run / "replay/episodes.jsonl").entries() if place is not None]
     assert [place.length for place in places][: len(before)] == [int(row["length"]) for row in before]

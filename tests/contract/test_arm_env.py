@@ -1,17 +1,17 @@
 """Episodes on the simulated arm with a scripted person: what the loop is told, and what the arm does meanwhile."""
 
 import threading
-import time
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
+from cqn_train.clock import REAL
 from cqn_train.interfaces import Interrupted, Label
 from cqn_train.operator.session import Event, State
 
-from .arm_bench import FPS, STEP_DEG, Bench, bench, soon
+from .arm_bench import FPS, HOME_DEG, STEP_DEG, Bench, bench
 
 pytest.importorskip("mujoco")
 LABELS = {Event.SUCCESS: Label.SUCCESS, Event.FAILURE: Label.FAILURE, Event.DISCARD: Label.DISCARD}
@@ -58,12 +58,12 @@ def test_a_label_ends_the_episode_at_any_moment(label: Event, moment: str) -> No
             outcome, steps = arm.step(5), 0
         elif moment == "in a step":
             arm.step(2)
-            arm.meanwhile(lambda: (time.sleep(0.4 / FPS), arm.do(label)))
+            arm.meanwhile(lambda: (arm.clock.sleep(0.4 / FPS), arm.do(label)))
             outcome, steps = arm.step(4), 2
         elif moment == "paused":
             arm.step(2)
             arm.do(Event.PAUSE)
-            arm.meanwhile(lambda: (time.sleep(0.05), arm.do(label)))
+            arm.meanwhile(lambda: (arm.clock.sleep(0.05), arm.do(label)))
             outcome, steps = arm.step(4), 1
         elif moment == "teaching":
             arm.do(Event.TAKE_OVER)
@@ -71,7 +71,7 @@ def test_a_label_ends_the_episode_at_any_moment(label: Event, moment: str) -> No
             arm.do(label)
             outcome, steps = arm.step(), 1
         else:
-            arm.meanwhile(lambda: (soon(arm.is_state(State.LABELLING)), time.sleep(0.05), arm.do(label)))
+            arm.meanwhile(lambda: (arm.soon(arm.is_state(State.LABELLING)), arm.clock.sleep(0.05), arm.do(label)))
             for step in range(4):
                 assert not arm.step(step).ended
             outcome, steps = arm.step(5), 5
@@ -92,8 +92,8 @@ def test_time_up_holds_the_arm_and_the_wait_is_a_persons(arm: Bench) -> None:
     seen: list[Any] = []
 
     def label() -> None:
-        soon(arm.is_state(State.LABELLING))
-        time.sleep(0.05)
+        arm.soon(arm.is_state(State.LABELLING))
+        arm.clock.sleep(0.05)
         sent = len(arm.goals)
         seen.append(arm.at_rest())
         seen.append(len(arm.goals) - sent)
@@ -119,10 +119,10 @@ def test_time_is_up_also_for_an_episode_that_is_paused_at_that_moment(
     monkeypatch.setattr(arm.env, "_time_up", lambda: (arm.do(Event.PAUSE), end()))
 
     def resume() -> None:
-        soon(arm.is_state(State.PAUSED))
-        time.sleep(0.05)
+        arm.soon(arm.is_state(State.PAUSED))
+        arm.clock.sleep(0.05)
         arm.do(Event.RESUME)
-        soon(arm.is_state(State.LABELLING))
+        arm.soon(arm.is_state(State.LABELLING))
         arm.do(Event.SUCCESS)
 
     arm.meanwhile(resume)
@@ -139,15 +139,15 @@ def test_a_pause_holds_the_arm_and_counts_for_nothing(arm: Bench) -> None:
     held: dict[str, Any] = {}
 
     def pause() -> None:
-        time.sleep(0.5 / FPS)
+        arm.clock.sleep(0.5 / FPS)
         arm.do(Event.PAUSE)
-        began, sent = time.monotonic(), len(arm.goals)
-        time.sleep(0.1)  # enough to stand still, and less than the watchdog's time
+        began, sent = arm.clock.now, len(arm.goals)
+        arm.clock.sleep(0.1)  # enough to stand still, and less than the watchdog's time
         held["soon"] = len(arm.goals) - sent
         held["rests"] = arm.at_rest()
         held["joints"], held["goals"] = arm.joints, arm.goals[sent:]
         arm.do(Event.RESUME)
-        held["seconds"] = time.monotonic() - began
+        held["seconds"] = arm.clock.now - began
 
     arm.meanwhile(pause)
     outcome = arm.step(20)
@@ -170,7 +170,7 @@ def test_a_pause_holds_the_arm_and_counts_for_nothing(arm: Bench) -> None:
 def test_a_pause_that_is_over_within_a_step_is_one_all_the_same(arm: Bench) -> None:
     arm.begin()
     arm.step(2)
-    arm.meanwhile(lambda: (time.sleep(0.4 / FPS), arm.do(Event.PAUSE, Event.RESUME)))
+    arm.meanwhile(lambda: (arm.clock.sleep(0.4 / FPS), arm.do(Event.PAUSE, Event.RESUME)))
     assert arm.step(4).skipped
     assert arm.env._steps == 1
     assert not arm.step(6).skipped
@@ -214,7 +214,7 @@ def test_a_stop_comes_through_at_any_moment(moment: str) -> None:
 
         def drive() -> None:
             if moment == "waiting":
-                arm.meanwhile(lambda: (time.sleep(0.05), arm.do(Event.STOP)))
+                arm.meanwhile(lambda: (arm.clock.sleep(0.05), arm.do(Event.STOP)))
                 arm.env.reset(0)
             arm.begin()
             for step in range(5):
@@ -224,19 +224,19 @@ def test_a_stop_comes_through_at_any_moment(moment: str) -> None:
             if moment == "going home":
                 arm.do(Event.SUCCESS)
                 arm.step(18)
-                arm.meanwhile(lambda: (time.sleep(0.1), arm.do(Event.STOP)))
+                arm.meanwhile(lambda: (arm.clock.sleep(0.1), arm.do(Event.STOP)))
                 arm.env.reset(0)
             if moment in ("running", "teaching"):
                 arm.do(Event.STOP)
             else:
-                arm.meanwhile(lambda: (time.sleep(0.3 / FPS), arm.do(Event.STOP)))
+                arm.meanwhile(lambda: (arm.clock.sleep(0.3 / FPS), arm.do(Event.STOP)))
             for _ in range(3):  # a goal that is under way is the last one
                 arm.step(20, 20)
 
         with pytest.raises(Interrupted):
             drive()
         assert arm.session.state is State.STOPPED
-        time.sleep(0.15)
+        arm.clock.sleep(0.15)
         held, place = arm.goals[-1].copy() if arm.goals else None, arm.joints
         assert arm.at_rest(0.25)
         assert np.abs(arm.joints - place).max() < 0.1
@@ -253,18 +253,18 @@ def test_a_stop_does_not_wait_for_a_reading_that_hangs(arm: Bench, monkeypatch: 
 
     def hang() -> Any:
         hangs.set()
-        go_on.wait(5)
+        arm.clock.wait(go_on, 5)
         return read()
 
     monkeypatch.setattr(arm.robot, "get_observation", hang)
     said = list[float]()
 
     def stop() -> None:
-        hangs.wait(5)
-        began, sent = time.monotonic(), len(arm.goals)
+        arm.clock.wait(hangs, 5)
+        began, sent = arm.clock.now, len(arm.goals)
         arm.do(Event.STOP)
-        said.append(time.monotonic() - began)
-        time.sleep(0.1)
+        said.append(arm.clock.now - began)
+        arm.clock.sleep(0.1)
         said.append(len(arm.goals) - sent)
         go_on.set()
 
@@ -278,11 +278,34 @@ def test_a_stop_does_not_wait_for_a_reading_that_hangs(arm: Bench, monkeypatch: 
         drive()
     assert said[0] < 0.05
     assert said[1] == 0
-    soon(arm.at_rest)
+    arm.soon(arm.at_rest)
     held = len(arm.goals)
-    time.sleep(0.25)
+    arm.clock.sleep(0.25)
     assert len({tuple(goal) for goal in arm.goals[held - 1 :]}) == 1  # the same hold again
     arm.check()
+
+
+@pytest.mark.real_time(reason="attendant, watchdog and person are threads that nobody puts in order, as on a real arm")
+def test_an_episode_a_pause_and_a_stop_with_threads_that_nobody_drives() -> None:
+    with bench(clock=REAL) as arm:
+        arm.begin()
+        for step in range(5):
+            assert not arm.step(2.0 * (step + 1)).ended
+        arm.meanwhile(lambda: (REAL.sleep(0.4 / FPS), arm.do(Event.PAUSE), REAL.sleep(0.05), arm.do(Event.RESUME)))
+        assert arm.step(12).skipped
+        arm.do(Event.SUCCESS)
+        assert arm.step(14).success
+        arm.soon(lambda: np.abs(arm.joints - HOME_DEG[:6]).max() < 0.5)
+        arm.begin()
+        arm.step(2)
+        arm.do(Event.STOP)
+        with pytest.raises(Interrupted):
+            arm.step(20)
+        arm.soon(arm.at_rest)
+        held = len(arm.goals)
+        REAL.sleep(0.25)
+        assert len({tuple(goal) for goal in arm.goals[held - 1 :]}) == 1
+        arm.check()
 
 
 def test_ctrl_c_interrupts_a_wait() -> None:
@@ -291,7 +314,7 @@ def test_ctrl_c_interrupts_a_wait() -> None:
         arm.begin()
         arm.step(5)
         arm.do(Event.PAUSE)
-        arm.meanwhile(lambda: (time.sleep(0.05), asked.append(True)))
+        arm.meanwhile(lambda: (arm.clock.sleep(0.05), asked.append(True)))
         with pytest.raises(Interrupted):
             arm.step(5)
         assert arm.session.state is State.PAUSED  # it is the process that ends
@@ -304,10 +327,10 @@ def test_an_episode_that_is_over_before_the_loop_looks_is_one(arm: Bench, presse
     """Else the loop would wait for a start that the session refuses, since it waits for the loop."""
 
     def press() -> None:
-        soon(lambda: not arm.session.busy)
+        arm.soon(lambda: not arm.session.busy)
         for event in presses:
             if Event.FAULT in presses and event in LABELS:
-                soon(arm.is_state(State.LABELLING))
+                arm.soon(arm.is_state(State.LABELLING))
             arm.do(event)
 
     arm.session.expect(0)
@@ -324,7 +347,7 @@ def test_an_episode_that_is_over_before_the_loop_looks_is_one(arm: Bench, presse
 def test_what_a_person_sees() -> None:
     with bench(cameras=("upper_wrist",)) as seeing:
         shown = seeing.display.shown
-        soon(lambda: seeing.display.shown > shown + 2)  # before any episode
+        seeing.soon(lambda: seeing.display.shown > shown + 2)  # before any episode
         seeing.begin()
         for _ in range(4):
             seeing.step(2)
@@ -338,4 +361,4 @@ def test_what_a_person_sees() -> None:
         assert "Control: " in seeing.env.summary()
         shown = seeing.display.shown
         seeing.do(Event.PAUSE)
-        soon(lambda: seeing.display.shown > shown + 2)  # while it is held
+        seeing.soon(lambda: seeing.display.shown > shown + 2)  # while it is held

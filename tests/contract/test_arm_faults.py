@@ -1,6 +1,5 @@
 """What goes wrong with an arm, at every moment, judged in the simulator: joints, their speed, and what is recorded."""
 
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -12,7 +11,7 @@ from cqn_train.operator.session import Event, State
 from cqn_train.robot.guard import RobotFault
 from cqn_train.sim_arm import FAULTS, Fault
 
-from .arm_bench import FPS, HOME_DEG, SPEED, STEP_DEG, Bench, bench, soon
+from .arm_bench import FPS, HOME_DEG, SPEED, STEP_DEG, Bench, bench
 
 pytest.importorskip("mujoco")
 
@@ -94,26 +93,26 @@ def test_faults_while_the_arm_is_driven(kind: str, moment: str) -> None:
         marks: dict[str, float] = {}
 
         def person() -> None:
-            soon(lambda: len(arm.goals) > 5)
+            arm.soon(lambda: len(arm.goals) > 5)
             if moment == "teaching":
                 arm.leader.pose = lambda: HOME_DEG + np.append(wave(len(arm.goals)), np.zeros(5))
                 arm.do(Event.TAKE_OVER)
                 taken = len(arm.goals)
-                soon(lambda: len(arm.goals) > taken + 5)
+                arm.soon(lambda: len(arm.goals) > taken + 5)
             marks["steps"] = arm.env._steps
             seconds = inject(arm, kind)
             if kind in SAID:
-                soon(arm.is_state(State.FAULTED))
+                arm.soon(arm.is_state(State.FAULTED))
                 assert SAID[kind] in arm.session.fault
                 marks["breaks"] = arm.session.breaks
                 sent = len(arm.goals)
                 with pytest.raises(Exception, match="label"):
                     arm.session.relabel(0, Label.SUCCESS)
-                soon(arm.is_state(State.LABELLING))
+                arm.soon(arm.is_state(State.LABELLING))
                 marks["holds"] = len(arm.goals) - sent
             else:
-                time.sleep(seconds)
-            soon(lambda: is_over(arm))
+                arm.clock.sleep(seconds)
+            arm.soon(lambda: is_over(arm))
             arm.do(Event.FAILURE)
 
         arm.begin()
@@ -140,23 +139,23 @@ def test_faults_while_the_arm_is_paused(kind: str) -> None:
         seen: list[State] = []
 
         def person() -> None:
-            soon(lambda: arm.env._steps >= 6)
+            arm.soon(lambda: arm.env._steps >= 6)
             arm.do(Event.PAUSE)
-            time.sleep(0.1)
+            arm.clock.sleep(0.1)
             place = arm.joints
             seconds = inject(arm, kind)
             if kind in QUIET:
-                time.sleep(seconds)
+                arm.clock.sleep(seconds)
                 assert arm.session.state is State.PAUSED
-                soon(lambda: is_over(arm))
+                arm.soon(lambda: is_over(arm))
                 assert np.abs(arm.joints - place).max() < 0.5
                 arm.do(Event.RESUME)
                 steps = arm.env._steps
-                soon(lambda: arm.env._steps > steps + 5)
+                arm.soon(lambda: arm.env._steps > steps + 5)
             else:
-                soon(arm.is_state(State.FAULTED))
+                arm.soon(arm.is_state(State.FAULTED))
                 seen.append(arm.session.state)
-                soon(arm.is_state(State.LABELLING))
+                arm.soon(arm.is_state(State.LABELLING))
                 assert np.abs(arm.joints - place).max() < 0.5
             arm.do(Event.DISCARD)
 
@@ -176,14 +175,14 @@ def test_faults_before_an_episode_starts(kind: str) -> None:
         arm.session.learning("")
         seconds = inject(arm, kind)
         if kind in QUIET:
-            time.sleep(seconds)
+            arm.clock.sleep(seconds)
             assert arm.session.state is State.WAITING
         else:
-            soon(arm.is_state(State.FAULTED))
+            arm.soon(arm.is_state(State.FAULTED))
             with pytest.raises(Exception, match="no place while faulted"):
                 arm.do(Event.START)
-            soon(arm.is_state(State.RESETTING))  # there was no episode to label
-        soon(lambda: is_over(arm))
+            arm.soon(arm.is_state(State.RESETTING))  # there was no episode to label
+        arm.soon(lambda: is_over(arm))
         assert arm.session.labels == {}
         works_again(arm)
         arm.check(springs=kind == "stuck_joint")
@@ -198,17 +197,17 @@ def test_faults_on_the_way_home(kind: str) -> None:
         arm.do(Event.SUCCESS)
         arm.step()
         away = arm.joints
-        soon(lambda: np.abs(arm.joints - away).max() > 1)
+        arm.soon(lambda: np.abs(arm.joints - away).max() > 1)
         inject(arm, kind)
         if kind == "stuck_joint":
-            soon(lambda: is_over(arm))
+            arm.soon(lambda: is_over(arm))
         else:
-            soon(arm.is_state(State.FAULTED))
-            soon(arm.is_state(State.RESETTING))
-            soon(arm.at_rest)  # whoever looked after it has the hands there: it does not set off by itself
+            arm.soon(arm.is_state(State.FAULTED))
+            arm.soon(arm.is_state(State.RESETTING))
+            arm.soon(arm.at_rest)  # whoever looked after it has the hands there: it does not set off by itself
             assert np.abs(arm.joints - HOME_DEG[:6]).max() > 2
             arm.do(Event.HOME)
-        soon(lambda: np.abs(arm.joints - HOME_DEG[:6]).max() < 0.5)
+        arm.soon(lambda: np.abs(arm.joints - HOME_DEG[:6]).max() < 0.5)
         assert arm.session.labels == {0: Label.SUCCESS}
         works_again(arm)
         arm.check(springs=kind == "stuck_joint")
@@ -223,7 +222,7 @@ def test_a_loop_that_stalls_leaves_an_arm_that_holds() -> None:
         for step in range(6):
             arm.step(*wave(step))
         sent, place = len(arm.goals), arm.joints
-        time.sleep(0.25 + 0.1 + 0.2)  # the watchdog's time, its own look, and room for a busy machine
+        arm.clock.sleep(0.25 + 0.1 + 0.2)  # the watchdog's time, its own look, and the arm's coming to rest
         assert arm.at_rest(0.45)
         assert len(arm.goals) == sent + 1
         assert np.abs(arm.joints - place).max() < 2 * STEP_DEG
@@ -255,11 +254,11 @@ def test_a_leader_that_cannot_be_read_is_a_fault() -> None:
     with bench() as arm:
 
         def person() -> None:
-            soon(lambda: arm.env._steps >= 5)
+            arm.soon(lambda: arm.env._steps >= 5)
             arm.do(Event.TAKE_OVER)
-            soon(lambda: arm.env._steps >= 10)
+            arm.soon(lambda: arm.env._steps >= 10)
             arm.leader.pose = lambda: np.array([1 / 0])
-            soon(arm.is_state(State.LABELLING))
+            arm.soon(arm.is_state(State.LABELLING))
             arm.leader.pose = HOME_DEG.copy
             arm.do(Event.FAILURE)
 
@@ -281,11 +280,11 @@ def test_a_leader_that_leaps_drags_the_arm_slowly(leap: np.ndarray) -> None:
         for _ in range(5):
             arm.step()
         arm.leader.pose = lambda: HOME_DEG + leap
-        arm.meanwhile(lambda: (time.sleep(0.4), arm.do(Event.FAILURE) if np.isfinite(leap).all() else None))
+        arm.meanwhile(lambda: (arm.clock.sleep(0.4), arm.do(Event.FAILURE) if np.isfinite(leap).all() else None))
         if np.isfinite(leap).all():
             drive(arm, wave)
         else:
-            arm.meanwhile(lambda: (soon(arm.is_state(State.LABELLING)), arm.do(Event.FAILURE)))
+            arm.meanwhile(lambda: (arm.soon(arm.is_state(State.LABELLING)), arm.do(Event.FAILURE)))
             kept, end, _ = drive(arm, wave)
             assert kept == []
             assert end.skipped
@@ -299,7 +298,7 @@ def test_an_arm_that_starts_outside_its_limits_does_not_leap() -> None:
         with arm.world.lock:
             arm.world.arm.place(place, 0.0)
             arm.world.lay_out()
-        soon(lambda: np.abs(arm.joints - np.degrees(place)).max() < 0.5)
+        arm.soon(lambda: np.abs(arm.joints - np.degrees(place)).max() < 0.5)
         arm.env.arm.guard.recover()
         arm.world.fastest = 0.0
         arm.begin()
@@ -307,7 +306,7 @@ def test_an_arm_that_starts_outside_its_limits_does_not_leap() -> None:
             arm.step(0, 0)
             if step == 3:
                 arm.do(Event.PAUSE)
-                arm.meanwhile(lambda: (time.sleep(0.1), arm.do(Event.RESUME)))
+                arm.meanwhile(lambda: (arm.clock.sleep(0.1), arm.do(Event.RESUME)))
         assert np.degrees(arm.world.fastest) * SPEED <= 1.6 * STEP_DEG * FPS
         assert np.abs(arm.joints - HOME_DEG[:6]).max() < 1
 
@@ -330,7 +329,7 @@ def test_a_fault_that_does_not_end_can_be_stopped() -> None:
         arm.begin()
         arm.step(1)
         arm.robot.config.faults = [Fault("disconnect", 0.0)]
-        arm.meanwhile(lambda: (soon(arm.is_state(State.FAULTED)), time.sleep(0.2), arm.do(Event.STOP)))
+        arm.meanwhile(lambda: (arm.soon(arm.is_state(State.FAULTED)), arm.clock.sleep(0.2), arm.do(Event.STOP)))
         with pytest.raises(Interrupted):
             arm.step(2)
         assert arm.session.labels == {}

@@ -1,8 +1,8 @@
 """`cqn-train` on the simulated arm, with a person who is a thread: what is learned from, stored, and taken up again."""
 
 import contextlib
+import functools
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,6 @@ import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from cqn_train import cli
 from cqn_train.arguments import parse
 from cqn_train.arm.environment import ArmEnvironment
 from cqn_train.build import build
@@ -25,7 +24,8 @@ from cqn_train.sim_arm import SimUR5eConfig
 from cqn_train.sim_arm.sim_ur5e import SimUR5e
 from cqn_train.sim_arm.world import WORLDS
 
-from .arm_bench import FPS, HOME_DEG, RAMP_S, SPEED, soon
+from ..driven_clock import DrivenClock, until
+from .arm_bench import FPS, HOME_DEG, RAMP_S, SPEED, Display
 from .conftest import TINY_POLICY
 from .test_cqn_train import tables
 
@@ -64,9 +64,12 @@ ARM = [
 
 
 @pytest.fixture(autouse=True)
-def _no_page(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thread steers the session itself; keys would need a terminal."""
-    monkeypatch.setattr(cli, "steering", lambda *_: contextlib.nullcontext())
+def clock(monkeypatch: pytest.MonkeyPatch) -> DrivenClock:
+    """By which trainer, arm and person live; a thread steers the session itself, since keys would need a terminal."""
+    clock = DrivenClock()
+    monkeypatch.setattr("cqn_train.build.steering", lambda *_: contextlib.nullcontext())
+    monkeypatch.setattr(SimUR5e, "clock", clock)
+    return clock
 
 
 class Hands:
@@ -75,12 +78,14 @@ class Hands:
     during: what else is done in an episode, by its number, before its label.
     """
 
-    def __init__(self, session: Session, env: ArmEnvironment, plan: list[Event], steps: int = 6) -> None:
-        self.session, self.env, self.plan, self.steps = session, env, plan, steps
+    def __init__(
+        self, session: Session, env: ArmEnvironment, plan: list[Event], clock: DrivenClock, steps: int = 6
+    ) -> None:
+        self.session, self.env, self.plan, self.clock, self.steps = session, env, plan, clock, steps
         self.during: dict[int, Callable[[], Any]] = {}
         self.errors: list[BaseException] = []
         self.leave = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread = clock.thread(self._run, "person")
 
     def __enter__(self) -> "Hands":
         self._thread.start()
@@ -101,7 +106,7 @@ class Hands:
             self.session.apply(Event.STOP)
 
     def _episode(self, label: Event) -> None:
-        session = self.session
+        session, soon = self.session, functools.partial(until, self.clock)
         soon(lambda: self.leave.is_set() or Event.START in session.allowed() or Event.READY in session.allowed())
         if session.state is State.RESETTING:
             session.apply(Event.READY)
@@ -114,29 +119,10 @@ class Hands:
 
     def drive(self, steps: int) -> None:
         """Let it go on for so many steps."""
-        begun = self.session.episode
-        soon(lambda: self.env.display.now == begun)  # type: ignore[attr-defined]
+        begun, soon = self.session.episode, functools.partial(until, self.clock)
+        soon(lambda: self.env.display.begun[-1:] == [begun])  # type: ignore[attr-defined]
         goal = self.env._steps + steps
         soon(lambda: self.leave.is_set() or self.env._steps >= goal)
-
-
-class Screen:
-    """In place of the page: which episode is on."""
-
-    now = -99
-
-    def show(self, _: Any) -> None:
-        """Nothing to see."""
-
-    def health(self, **_: Any) -> None:
-        """Nothing to see."""
-
-    def begin_episode(self, number: int) -> None:
-        """One begins."""
-        self.now = number
-
-    def end_episode(self, *_: Any) -> None:
-        """One is over."""
 
 
 def run(
@@ -148,11 +134,12 @@ def run(
     """Train until the plan is done, the run is complete, or fails; returns the trainer, and whether it was stopped."""
     stopped = False
     with ConsoleMonitor() as monitor, contextlib.ExitStack() as stack:
-        trainer = build(parse(arguments).validate(), monitor, lambda: bool(asked), stack)
+        trainer = build(parse(arguments).validate(), monitor, lambda: bool(asked), stack, SimUR5e.clock)
         assert isinstance(trainer.env, ArmEnvironment)
         assert isinstance(trainer.person, Session)
-        trainer.env.display = Screen()
-        hands = Hands(trainer.person, trainer.env, plan)
+        assert isinstance(trainer.clock, DrivenClock)
+        trainer.env.display = Display()
+        hands = Hands(trainer.person, trainer.env, plan, trainer.clock)
         prepare(trainer, hands)
         with hands:
             try:
@@ -221,8 +208,8 @@ def test_what_a_person_drives_is_learned_from_though_it_failed(demonstrations: l
 
         trainer.env.step = spy  # type: ignore[method-assign]
         hands.during[0] = lambda: (
-            hands.session.apply(Event.TAKE_OVER), hands.drive(8), hands.session.apply(Event.PAUSE), time.sleep(0.05),
-            hands.session.apply(Event.RESUME), hands.drive(4),
+            hands.session.apply(Event.TAKE_OVER), hands.drive(8), hands.session.apply(Event.PAUSE),
+            hands.clock.sleep(0.05), hands.session.apply(Event.RESUME), hands.drive(4),
         )  # fmt: skip
 
     trainer, _ = run([*ARM, *demonstrations, f"--output_dir={tmp_path / 'run'}"], [F], prepare)
@@ -301,15 +288,17 @@ def test_a_second_thought_right_before_the_stop_counts(demonstrations: list[str]
     assert again.counters.episodes == 2
 
 
-def test_minutes_are_of_acting_and_learning_and_not_of_waiting(demonstrations: list[str], tmp_path: Path) -> None:
+def test_minutes_are_of_acting_and_learning_and_not_of_waiting(
+    demonstrations: list[str], tmp_path: Path, clock: DrivenClock
+) -> None:
     def prepare(trainer: Trainer, hands: Hands) -> None:
         session = hands.session
-        hands.during[0] = lambda: (session.apply(Event.PAUSE), time.sleep(1.0), session.apply(Event.RESUME))
+        hands.during[0] = lambda: (session.apply(Event.PAUSE), hands.clock.sleep(1.0), session.apply(Event.RESUME))
 
     arguments = [*ARM, *demonstrations, f"--output_dir={tmp_path / 'run'}", "--online_minutes=0.012"]
-    began = time.monotonic()
+    began = clock.now
     trainer, stopped = run(arguments, [F] * 30, prepare)
-    passed = time.monotonic() - began
+    passed = clock.now - began
     assert not stopped  # the run is complete
     assert trainer.counters.episodes >= 2
     assert trainer.env.waited_s >= 0.5  # of the pause, once it is noticed
@@ -320,10 +309,23 @@ def test_minutes_are_of_acting_and_learning_and_not_of_waiting(demonstrations: l
 def test_learning_beside_an_episode(demonstrations: list[str], tmp_path: Path) -> None:
     """Updates go on while the arm is driven by a copy that does not change, and end with the episode."""
     beside: list[str] = []
+    learned = threading.Semaphore(0)
 
     def prepare(trainer: Trainer, hands: Hands) -> None:
         update = trainer._update
-        trainer._update = lambda b: (beside.append(threading.current_thread().name), update(b))[1]  # type: ignore[method-assign]
+
+        def spy(batch: Any) -> Any:
+            beside.append(threading.current_thread().name)
+            stats = update(batch)
+            if beside[-1] == "updates":
+                learned.release()
+            return stats
+
+        def wait() -> None:  # the updates take a time of their own, and an episode here nearly none
+            assert all(learned.acquire(timeout=60) for _ in range(5))
+
+        trainer._update = spy  # type: ignore[method-assign]
+        hands.during = {0: wait, 1: wait}
 
     arguments = [*ARM, *demonstrations, f"--output_dir={tmp_path / 'run'}", "--async_updates=5"]
     trainer, _ = run(arguments, [S, F], prepare)
@@ -350,7 +352,11 @@ def test_ctrl_c_in_an_episode_drops_it_and_saves(demonstrations: list[str], tmp_
     folder, asked = f"--output_dir={tmp_path / 'run'}", list[bool]()
 
     def prepare(trainer: Trainer, hands: Hands) -> None:
-        hands.during[1] = lambda: (asked.append(True), hands.leave.wait(5), hands.session.apply(Event.STOP))
+        hands.during[1] = lambda: (
+            asked.append(True),
+            hands.clock.wait(hands.leave, 5),
+            hands.session.apply(Event.STOP),
+        )
 
     trainer, stopped = run([*ARM, *demonstrations, folder], [S, F], prepare, asked)
     assert stopped
@@ -365,7 +371,7 @@ def test_evaluations_on_an_arm_are_not_learned_from(demonstrations: list[str], t
         def pause() -> None:
             assert Event.TAKE_OVER not in hands.session.allowed()
             hands.session.apply(Event.PAUSE)
-            time.sleep(0.05)
+            hands.clock.sleep(0.05)
             hands.session.apply(Event.RESUME)
 
         hands.during[-1] = pause

@@ -5,9 +5,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,6 +22,7 @@ from lerobot_cqn.modeling_cqn import CQNPolicy
 
 from ..toy_datasets import make_dataset
 from .conftest import STATION, TINY_POLICY, TINY_RUN, Command
+from .zygote import Zygote, wait_until
 
 Rows = list[dict[str, str]]
 
@@ -43,22 +41,6 @@ def assert_same_run(one: Path, other: Path) -> None:
     a, b = (load_file(run / "checkpoints/last/pretrained_model/model.safetensors") for run in (one, other))
     assert a.keys() == b.keys()
     assert [key for key in a if not torch.equal(a[key], b[key])] == []
-
-
-def start(*arguments: str) -> subprocess.Popen[str]:
-    """`cqn-train` as a process of its own."""
-    executable = str(Path(sys.executable).parent / "cqn-train")
-    return subprocess.Popen(
-        [executable, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ)
-    )
-
-
-def wait_for(ready: Callable[[], bool], process: subprocess.Popen[str]) -> None:
-    deadline = time.monotonic() + 120
-    while not ready():
-        assert process.poll() is None, process.communicate()[1]
-        assert time.monotonic() < deadline
-        time.sleep(0.003)
 
 
 # -- a run -----------------------------------------------------------------------------------------------------
@@ -147,15 +129,16 @@ def test_films_of_evaluations(click: list[str], tmp_path: Path) -> None:
     assert (tmp_path / "run" / "first_batch.png").stat().st_size > 1000
 
 
-def test_ctrl_c_saves_and_says_how_to_continue(click: list[str], tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    process = start(*TINY_RUN, *click, "--steps=1000000", f"--output_dir={run}")
-    wait_for(
-        lambda: (run / "evaluations.csv").exists() and len(tables(run)["episodes"]) >= 2, process
-    )  # the last table to be made
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == 130
+def test_ctrl_c_saves_and_says_how_to_continue(click: list[str], tmp_path: Path, processes: Zygote) -> None:
+    run, said_out, said_err = (tmp_path / name for name in ("run", "out", "err"))
+    steps = ["--steps=1000000", f"--output_dir={run}"]
+    process = processes.start("cqn-train", *TINY_RUN, *click, *steps, out=str(said_out), err=str(said_err))
+    # The last table to be made is that of the evaluations.
+    wait_until(lambda: (run / "evaluations.csv").exists() and len(tables(run)["episodes"]) >= 2)
+    os.kill(process, signal.SIGINT)
+    code = os.waitstatus_to_exitcode(processes.wait(process))
+    out, err = said_out.read_text(), said_err.read_text()
+    assert code == 130
     # All that a person sees beside the progress: nothing of the libraries below.
     said = [line for line in err.splitlines() if line]
     assert len(said) == 2, err

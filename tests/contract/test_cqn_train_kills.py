@@ -4,7 +4,6 @@ import os
 import random
 import signal
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -14,20 +13,7 @@ from cqn_train.replay.files import Journal, Place
 
 from .conftest import TINY_RUN
 from .test_cqn_train import assert_same_run, tables
-from .zygote import Zygote, zygote
-
-
-def wait_until(ready: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 120
-    while not ready():
-        assert time.monotonic() < deadline, "nothing happened"
-        time.sleep(0.003)
-
-
-@pytest.fixture(scope="module")
-def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Zygote]:
-    with zygote("cqn_train.cli", tmp_path_factory.mktemp("zygote") / "log") as started:
-        yield started
+from .zygote import Zygote, wait_until
 
 
 @pytest.mark.parametrize("saves", [1, 2, 4])
@@ -35,7 +21,7 @@ def test_killed_at_a_checkpoint_and_resumed_equals_uninterrupted(
     straight: Path, click: list[str], tmp_path: Path, saves: int, processes: Zygote
 ) -> None:
     run = tmp_path / "run"
-    process = processes.start(*TINY_RUN, *click, f"--output_dir={run}", dies_after_save=saves)
+    process = processes.start("cqn-train", *TINY_RUN, *click, f"--output_dir={run}", dies_after_save=saves)
     assert os.WTERMSIG(processes.wait(process)) == signal.SIGKILL
     assert main(["--resume=true", f"--output_dir={run}"]) == 0
     assert_same_run(straight, run)
@@ -55,7 +41,9 @@ def test_killed_at_twenty_random_moments_it_loses_no_finished_episode(
     def completed() -> int:
         return journal.path.read_bytes().count(b'{"episode"') if journal.path.is_file() else 0
 
-    process = processes.start(*TINY_RUN, *click, steps, "--save_freq=70", "--eval.freq=0", f"--output_dir={run}")
+    process = processes.start(
+        "cqn-train", *TINY_RUN, *click, steps, "--save_freq=70", "--eval.freq=0", f"--output_dir={run}"
+    )
     wait_until((run / "checkpoints" / "last").exists)
     before = 0
     for kill in range(20):
@@ -70,7 +58,7 @@ def test_killed_at_twenty_random_moments_it_loses_no_finished_episode(
         rows = [int(row["episode"]) for row in tables(run)["episodes"]]
         assert rows == list(range(len(rows)))
         if kill < 19:
-            process = processes.start("--resume=true", f"--output_dir={run}")
+            process = processes.start("cqn-train", "--resume=true", f"--output_dir={run}")
     total = sum(place.length for place in finished())
     assert main(["--resume=true", f"--output_dir={run}", f"--steps={total}"]) == 0
     episodes = tables(run)["episodes"]

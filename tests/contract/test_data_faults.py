@@ -16,7 +16,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from cqn_data.cli import main
 
-from .zygote import zygote
+from .zygote import wait_until, zygote
 
 CODE = "import sys; from cqn_data.cli import main; sys.exit(main(sys.argv[1:]))"
 SIDE, LENGTHS = 64, (40, 40, 40)
@@ -66,29 +66,23 @@ def complete(target):
     assert json.loads((target / "meta/cqn_history.json").read_text())["operations"]
 
 
-def wait_for(condition, process, seconds=60):
-    """Until the condition holds or the process has ended."""
-    end = time.monotonic() + seconds
-    while not condition() and process.poll() is None:
-        assert time.monotonic() < end, "nothing happened"
-        time.sleep(0.002)
-
-
+@pytest.mark.real_time(reason="the kills come at shares of the time that a run takes")
 def test_killed_at_any_moment_the_target_is_complete_or_absent_and_the_next_run_tidies_up(recording, tmp_path):
     before = snapshot(recording)
     folder = tmp_path / "out"
     folder.mkdir()
     target = folder / "dst"
-    with zygote("cqn_data.cli", tmp_path / "log", preload="cqn_data.disk.encode, cqn_data.disk.readable") as processes:
+    preload = "cqn_data.cli, cqn_data.disk.encode, cqn_data.disk.readable"
+    with zygote(tmp_path / "log", preload) as processes:
         begun = time.monotonic()
-        process = processes.start(*arguments(recording, target))
+        process = processes.start("cqn-data", *arguments(recording, target))
         assert processes.wait(process) == 0
         took = time.monotonic() - begun
         complete(target)
         absent = left = 0
         for moment in MOMENTS:
             shutil.rmtree(target, ignore_errors=True)
-            process = processes.start(*arguments(recording, target))
+            process = processes.start("cqn-data", *arguments(recording, target))
             time.sleep(moment * took)
             processes.kill(process)
             if target.exists():
@@ -109,18 +103,19 @@ def test_killed_at_any_moment_the_target_is_complete_or_absent_and_the_next_run_
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_stopped_by_a_person_it_leaves_nothing(recording, tmp_path, number):
-    target = tmp_path / "dst"
-    process = start(recording, target, start_new_session=True)
-    wait_for(lambda: any(tmp_path.glob(".dst.*.tmp/videos")), process)
-    os.kill(process.pid, number)
-    _, err = process.communicate(timeout=60)
-    if process.returncode == 0:
+def test_stopped_by_a_person_it_leaves_nothing(recording, tmp_path, number, processes):
+    folder, said = tmp_path / "out", tmp_path / "err"
+    folder.mkdir()
+    process = processes.start("cqn-data", *arguments(recording, folder / "dst"), err=str(said))
+    wait_until(lambda: any(folder.glob(".dst.*.tmp/videos")) or (folder / "dst").exists())
+    os.kill(process, number)
+    code, err = os.waitstatus_to_exitcode(processes.wait(process)), said.read_text()
+    if code == 0:
         pytest.skip("it was done before the signal came")
-    assert process.returncode == 130
+    assert code == 130
     assert "nothing was written" in err
     assert "Traceback" not in err
-    assert list(tmp_path.iterdir()) == []
+    assert list(folder.iterdir()) == []
 
 
 def test_a_disk_that_takes_no_more_is_named_in_one_line(recording, tmp_path):
@@ -147,13 +142,10 @@ def test_a_place_that_cannot_be_written_to_is_named(recording, tmp_path, capsys)
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_two_runs_for_one_place_do_not_mix(recording, tmp_path):
-    target = tmp_path / "dst"
-    processes = [start(recording, target), start(recording, target)]
-    codes = []
-    for process in processes:
-        _, err = process.communicate(timeout=180)
-        codes.append(process.returncode)
-        assert "Traceback" not in err
+def test_two_runs_for_one_place_do_not_mix(recording, tmp_path, processes):
+    target, said = tmp_path / "dst", [tmp_path / "one", tmp_path / "other"]
+    runs = [processes.start("cqn-data", *arguments(recording, target), err=str(err)) for err in said]
+    codes = [os.waitstatus_to_exitcode(processes.wait(run)) for run in runs]
+    assert all("Traceback" not in err.read_text() for err in said)
     assert sorted(codes) == [0, 2]
     complete(target)

@@ -202,12 +202,12 @@ def test_ctrl_c_saves_the_finished_episodes(root):
         text=True,
         env={**os.environ, "PYTHONPATH": here, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"},
     )
-    deadline = time.monotonic() + 90
+    deadline = time.monotonic() + 180
     while not list(root.parent.glob(".toy.*/data/*/*.parquet")) and time.monotonic() < deadline:
         time.sleep(0.1)
     time.sleep(0.5)
     process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=30)
+    _, error = process.communicate(timeout=180)
     assert process.returncode == 130, error
     dataset = LeRobotDataset("local/toy", root)
     assert dataset.num_episodes >= 1

@@ -18,8 +18,11 @@ playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra 
 from cqn_train.operator.page.server import OperatorServer  # noqa: E402
 
 CHROMIUM = Path("/usr/bin/chromium")
-pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"needs a browser at {CHROMIUM}")
-WAIT_MS = 15_000
+pytestmark = [
+    pytest.mark.skipif(not CHROMIUM.exists(), reason=f"needs a browser at {CHROMIUM}"),
+    pytest.mark.real_time(reason="a browser shows and sends in its own time"),
+]
+WAIT_MS = 60_000
 PHONE = {"width": 375, "height": 812}
 NAMES = {
     "start": "Start", "pause": "Pause", "resume": "Resume", "success": "Success", "failure": "Failure",

@@ -1,6 +1,8 @@
 """The operator's page under anything at all: nothing breaks, and nothing changes without the token."""
 
 import json
+import socket
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -13,7 +15,15 @@ pytest.importorskip("fastapi", reason="needs the extra [page]")
 
 from fastapi.testclient import TestClient
 
-from .operator_clients import TOKEN, board_fixture, client_fixture, clock_fixture  # noqa: F401  # fixtures
+from cqn_train.operator.page.server import OperatorServer
+
+from .operator_clients import (  # noqa: F401  # fixtures
+    TOKEN,
+    board_fixture,
+    client_fixture,
+    clock_fixture,
+    server_fixture,
+)
 
 words = st.sampled_from(
     ["event", "start", "stop", "pause", "success", "fault", "absent", "label", "episode", "id", "client", "token", "x"]
@@ -48,13 +58,18 @@ extra = st.dictionaries(names, st.text(st.characters(min_codepoint=32, max_codep
 FUZZ = settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
+def ask(client: TestClient, method: str, path: str, query: dict, headers: dict, body: bytes) -> Any:
+    """The answer to a request by its whole address: of `//api` alone the client would take `api` for a host."""
+    return client.request(method, f"{client.base_url}{path}", params=query, headers=headers, content=body)
+
+
 @FUZZ
 @given(methods, routes, queries, extra, bodies)
 def test_without_the_token_nothing_changes_whatever_is_sent(
     client: TestClient, board: Board, method: str, path: str, query: dict, headers: dict, body: bytes
 ) -> None:
     before = (board.session.snapshot(), client.app.state.control.snapshot(None))
-    answer = client.request(method, path, params=query, headers=headers, content=body)
+    answer = ask(client, method, path, query, headers, body)
     # What was asked for, once the client has put it straight: "/.." is "/".
     page = answer.request.method == "GET" and answer.request.url.path in client.app.state.public
     assert answer.status_code in (401, 403) or (page and answer.status_code in (200, 206, 304, 416))
@@ -72,7 +87,7 @@ def test_with_the_token_only_what_the_state_machine_allows(
     client.app.state.control.take("ann")
     query = {name: value for name, value in query.items() if name != "token"} | ({"client": who} if who else {})
     headers = {name: value for name, value in headers.items() if name != "Origin"} | {"X-Token": TOKEN}
-    answer = client.request(method, path, params=query, headers=headers, content=body)
+    answer = ask(client, method, path, query, headers, body)
     assert answer.status_code < 500
     if session.state is not state:
         allowed = {target for event, target in TRANSITIONS[state].items() if event not in BY_ITSELF}
@@ -94,3 +109,28 @@ def test_whatever_comes_over_the_websocket_is_answered(client: TestClient, board
         while (message := page.receive_json()).get("answer") != 77:
             assert "snapshot" in message or isinstance(message["ok"], bool)
         assert message["ok"]
+
+
+steps = st.sampled_from(["", "api", "state", "event", "..", ".", "%2e%2e", "%00", "ws"])
+targets = st.one_of(
+    st.lists(steps, min_size=1, max_size=5).map(lambda parts: "/" + "/".join(parts)),
+    st.sampled_from(["*", "//", "////api", "http://127.0.0.1/api/state", "//evil.example/api/state", "/api/state?"]),
+    st.text(st.characters(min_codepoint=33, max_codepoint=255), max_size=12),
+).map(lambda text: text.encode("latin-1"))
+
+
+@FUZZ
+@given(st.sampled_from([b"GET", b"POST", b"HEAD", b"CONNECT", b"", b"get"]), targets)
+def test_what_no_client_would_send_is_refused_by_the_server(
+    server: OperatorServer, board: Board, method: bytes, target: bytes
+) -> None:
+    """Bytes over a socket: no client puts the path straight, or refuses it, before the server sees it."""
+    before = (board.session.snapshot(), server.control.snapshot(None))
+    host = f"127.0.0.1:{server.port}".encode()
+    with socket.create_connection(("127.0.0.1", server.port), timeout=60) as raw:
+        raw.sendall(method + b" " + target + b" HTTP/1.1\r\nHost: " + host + b"\r\nConnection: close\r\n\r\n")
+        answer = raw.makefile("rb").readline().split()
+    assert answer[0] == b"HTTP/1.1"
+    page = target.partition(b"?")[0] == b"/" and answer[1] == b"200"
+    assert page or answer[1] in (b"400", b"401", b"403")
+    assert (board.session.snapshot(), server.control.snapshot(None)) == before

@@ -1,7 +1,6 @@
 """The simulated arm and its leader through LeRobot's commands, in real time and faster."""
 
 import re
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from cqn_train.sim_arm.sim_ur5e import SimUR5e, from_robot_units, to_robot_units
 from cqn_train.sim_arm.world import WORLDS
 from lerobot_cqn.errors import ConfigError
 
+from ..driven_clock import DrivenClock
 from .terminal import record_demonstrations
 
 pytest.importorskip("mujoco")
@@ -24,10 +24,16 @@ PAN = np.array([1.0, 0, 0, 0, 0, 0])
 
 
 @pytest.fixture
-def arm() -> Iterator[SimUR5e]:
+def clock() -> DrivenClock:
+    return DrivenClock()
+
+
+@pytest.fixture
+def arm(clock: DrivenClock) -> Iterator[SimUR5e]:
     robot = make_robot_from_config(
         SimUR5eConfig(camera_names=["upper_wrist"], image_height=32, image_width=48, speed=5)
     )
+    robot.clock = clock
     robot.connect()
     yield robot
     if robot.is_connected:
@@ -59,10 +65,10 @@ def test_it_gives_what_its_features_say_and_goes_where_it_is_sent(arm: SimUR5e) 
     assert arm.world.until(reached, 5)
 
 
-def test_time_passes_whether_it_is_asked_or_not(arm: SimUR5e) -> None:
+def test_time_passes_whether_it_is_asked_or_not(arm: SimUR5e, clock: DrivenClock) -> None:
     arm.get_observation()
     before = arm.world.now
-    time.sleep(0.2)
+    clock.sleep(0.2)
     arm.get_observation()
     assert 0.9 < arm.world.now - before < 2.5  # at five times the speed
 
@@ -123,19 +129,19 @@ def test_faults_of_sending_and_of_sensors(arm: SimUR5e) -> None:
     assert np.array_equal(later["upper_wrist"], seen["upper_wrist"])
 
 
-def test_a_stuck_joint_stays_and_a_delay_delays(arm: SimUR5e) -> None:
+def test_a_stuck_joint_stays_and_a_delay_delays(arm: SimUR5e, clock: DrivenClock) -> None:
     before = arm.get_observation()
     arm.config.faults = [Fault("stuck_joint", 0, amount=2)]
     for _ in range(20):
         arm.send_action(goal(arm, elbow=before["elbow.pos"] + 10, shoulder_pan=before["shoulder_pan.pos"] + 5))
-        time.sleep(0.02)
+        clock.sleep(0.02)
     after = arm.get_observation()
     assert after["elbow.pos"] == pytest.approx(before["elbow.pos"], abs=1)
     assert after["shoulder_pan.pos"] > before["shoulder_pan.pos"] + 3
     arm.config.faults = [Fault("delay", 0, amount=0.3)]
-    begun = time.monotonic()
+    begun = clock.now = 200.0  # 0.3 s after a round moment is not a little less
     arm.get_observation()
-    assert time.monotonic() - begun >= 0.3
+    assert clock.now - begun >= 0.3
 
 
 @pytest.mark.parametrize(("settings", "said"), [
@@ -150,6 +156,7 @@ def test_wrong_settings(settings: dict[str, object], said: str) -> None:
     assert len(FAULTS) == 8
 
 
+@pytest.mark.real_time(reason="lerobot-record keeps its rate by the machine's own clock")
 def test_lerobot_record_mirrors_the_leader(tmp_path: Path) -> None:
     """As a person at the terminal: ends the episode when the task is done, and the reset when the arm is home."""
     root = record_demonstrations(tmp_path, "--robot.camera_names=[upper_wrist]", "--robot.state=true", episodes=3)

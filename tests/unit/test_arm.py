@@ -16,7 +16,8 @@ from cqn_train.robot.limits import Limits
 from cqn_train.robot.settings import ArmSettings
 from lerobot_cqn.errors import ConfigError
 
-from .test_robot_guard import Clock, Motors, limits
+from ..driven_clock import DrivenClock
+from .test_robot_guard import Motors, limits
 
 NAMES = ("a.pos", "b.pos", "gripper.pos")
 D, FPS = 3, 10
@@ -70,8 +71,8 @@ class Leader:
         self.led.append(feedback)
 
 
-def made(leader: Leader | None = None, home: Any = None, **settings: Any) -> tuple[Arm, Gripped, Clock]:
-    motors, clock = Gripped(), Clock()
+def made(leader: Leader | None = None, home: Any = None, **settings: Any) -> tuple[Arm, Gripped, DrivenClock]:
+    motors, clock = Gripped(), DrivenClock(0.0)
     guard = Guard(motors, limits(), GuardSettings(), clock)  # type: ignore[arg-type]
     arm = Arm(guard, ArmSettings(**settings), FPS, leader=leader, clutched=[0, 1], home=home)  # type: ignore[arg-type]
     motors.connect()
@@ -172,7 +173,8 @@ def test_a_frame_is_what_the_dataset_calls_it() -> None:
     assert frame["observation.state"].dtype == torch.float32
     picture = frame["observation.images.eye"]
     assert picture.shape == (1, 3, 4, 6)
-    assert picture[0, :2, 1, 2].tolist() == pytest.approx([1.0, 0.2])
+    assert picture.dtype == torch.uint8  # as the camera gave it
+    assert (picture[0, :2, 1, 2] / 255).tolist() == pytest.approx([1.0, 0.2])
 
 
 def test_both_are_disconnected_whatever_fails(monkeypatch: pytest.MonkeyPatch) -> None:

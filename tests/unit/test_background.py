@@ -11,34 +11,34 @@ from cqn_train.loop.background import Background
 Stop = Callable[[], bool]
 
 
-def wait_for(ready: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 5
-    while not ready():
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
-
-
 def test_it_runs_beside_and_ends_with_the_block() -> None:
     done: list[int] = []
-    threads = set[str]()
+    threads, under_way = list[threading.Thread](), threading.Event()
 
     def work(stop: Stop) -> None:
-        threads.add(threading.current_thread().name)
+        threads.append(threading.current_thread())
         while not stop():
             done.append(len(done))
-            time.sleep(0.001)
+            if len(done) > 3:
+                under_way.set()
+            time.sleep(0)  # lets the block go on
 
     with Background(work):
-        wait_for(lambda: len(done) > 3)
+        assert under_way.wait(60)
     ended = len(done)
-    time.sleep(0.02)
-    assert len(done) == ended  # joined: nothing learns while the run saves
-    assert threads == {"updates"}
+    assert not threads[0].is_alive()  # joined: nothing learns while the run saves
+    assert len(done) == ended
+    assert {thread.name for thread in threads} == {"updates"}
 
 
 def test_work_that_is_done_early_does_not_end_the_block() -> None:
-    with Background(lambda _: None):
-        time.sleep(0.01)
+    threads, reached = list[threading.Thread](), list[str]()
+    with Background(lambda _: threads.append(threading.current_thread())) as background:
+        background._thread.join(60)
+        assert not threads[0].is_alive()
+        reached.append("the episode goes on")
+    reached.append("and what comes after it")
+    assert reached == ["the episode goes on", "and what comes after it"]
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError("learner"), KeyboardInterrupt()])
@@ -51,7 +51,7 @@ def test_its_error_surfaces_when_the_block_ends(error: BaseException) -> None:
 
     def run() -> None:
         with Background(work):
-            failed.wait(5)
+            assert failed.wait(60)
             reached.append("the episode goes on")
         reached.append("nothing comes after")
 
@@ -63,7 +63,7 @@ def test_its_error_surfaces_when_the_block_ends(error: BaseException) -> None:
 def test_the_blocks_own_error_comes_first() -> None:
     def work(stop: Stop) -> None:
         while not stop():
-            time.sleep(0.001)
+            time.sleep(0)
         raise KeyError("later")
 
     with pytest.raises(ZeroDivisionError), Background(work):

@@ -15,15 +15,7 @@ from cqn_train.operator.board import Board
 from cqn_train.operator.control import LEFT_S, Control, ViewingOnlyError
 from cqn_train.operator.session import Event, Label, RefusedError, Session, State
 
-
-class Clock:
-    """Seconds that pass when told to."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
+from ..driven_clock import DrivenClock
 
 
 def picture(value: int = 0, height: int = 48, width: int = 64) -> np.ndarray:
@@ -31,12 +23,12 @@ def picture(value: int = 0, height: int = 48, width: int = 64) -> np.ndarray:
 
 
 @pytest.fixture
-def clock() -> Clock:
-    return Clock()
+def clock() -> DrivenClock:
+    return DrivenClock()
 
 
 @pytest.fixture
-def board(clock: Clock) -> Board:
+def board(clock: DrivenClock) -> Board:
     return Board(Session(), clock=clock)
 
 
@@ -93,13 +85,13 @@ def test_what_is_no_picture_is_named_once(board: Board) -> None:
     assert board.snapshot()["cameras"] == ["good"]
 
 
-def test_a_picture_that_is_not_renewed_is_seen_to_age(board: Board, clock: Clock) -> None:
+def test_a_picture_that_is_not_renewed_is_seen_to_age(board: Board, clock: DrivenClock) -> None:
     board.show({"front": picture()})
     clock.now += 4
     assert board.snapshot()["camera_age_s"] == {"front": 4.0}
 
 
-def film(board: Board, clock: Clock, number: int, seconds: float, hz: float = 20) -> None:
+def film(board: Board, clock: DrivenClock, number: int, seconds: float, hz: float = 20) -> None:
     board.session.learning("")
     if board.session.state is State.RESETTING:
         board.session.apply(Event.READY)
@@ -112,7 +104,7 @@ def film(board: Board, clock: Clock, number: int, seconds: float, hz: float = 20
     board.end_episode(number, round(seconds * hz), seconds)
 
 
-def test_a_film_has_the_rate_and_the_times_of_what_happened(board: Board, clock: Clock) -> None:
+def test_a_film_has_the_rate_and_the_times_of_what_happened(board: Board, clock: DrivenClock) -> None:
     film(board, clock, 0, seconds=4)
     times = board.film_times(0, "front")
     assert times == pytest.approx(np.arange(20) / 5, abs=0.06)
@@ -122,7 +114,7 @@ def test_a_film_has_the_rate_and_the_times_of_what_happened(board: Board, clock:
     assert board.film_times(0, "wrist") is board.film_times(1, "front") is None
 
 
-def test_a_pause_is_left_out_of_the_film(board: Board, clock: Clock) -> None:
+def test_a_pause_is_left_out_of_the_film(board: Board, clock: DrivenClock) -> None:
     board.session.apply(Event.START)
     board.begin_episode(0)
     board.show({"front": picture()})
@@ -135,7 +127,7 @@ def test_a_pause_is_left_out_of_the_film(board: Board, clock: Clock) -> None:
     assert board.film_times(0, "front") == [0.0, 0.2]
 
 
-def test_only_the_last_films_are_kept_and_none_between_episodes(board: Board, clock: Clock) -> None:
+def test_only_the_last_films_are_kept_and_none_between_episodes(board: Board, clock: DrivenClock) -> None:
     for number in range(8):
         film(board, clock, number, seconds=0.5)
         board.show({"front": picture()})
@@ -144,7 +136,7 @@ def test_only_the_last_films_are_kept_and_none_between_episodes(board: Board, cl
     assert len(board.film_times(7, "front")) == 3
 
 
-def test_a_long_film_of_large_pictures_stays_small(clock: Clock) -> None:
+def test_a_long_film_of_large_pictures_stays_small(clock: DrivenClock) -> None:
     board = Board(Session(), clock=clock)
     board._films._film_bytes = 40 * picture(0, 240, 320).nbytes
     board.session.apply(Event.START)
@@ -158,7 +150,7 @@ def test_a_long_film_of_large_pictures_stays_small(clock: Clock) -> None:
     assert np.diff(times).max() < 10
 
 
-def test_progress_and_time_left(board: Board, clock: Clock) -> None:
+def test_progress_and_time_left(board: Board, clock: DrivenClock) -> None:
     board.phase("updates", 400, 100)
     clock.now += 10
     board.advance(200, "loss 0.1")
@@ -190,7 +182,7 @@ def test_learning_curve(board: Board) -> None:
     assert board.snapshot()["curve"]["episodes"][4:] == [[4, 1, 0.8], [6, 1, 1.0]]
 
 
-def test_timers(board: Board, clock: Clock) -> None:
+def test_timers(board: Board, clock: DrivenClock) -> None:
     clock.now += 5
     board.session.apply(Event.START)
     board.begin_episode(0)
@@ -207,7 +199,7 @@ def test_timers(board: Board, clock: Clock) -> None:
     assert (timers["state_s"], timers["busy_s"], timers["episode_s"]) == (7, 7, 4.5)
 
 
-def test_finished_episodes_come_in_the_order_of_their_ends(board: Board, clock: Clock) -> None:
+def test_finished_episodes_come_in_the_order_of_their_ends(board: Board, clock: DrivenClock) -> None:
     film(board, clock, 0, 0.5)
     board.session.expect(None)
     film(board, clock, -1, 0.5)
@@ -273,7 +265,7 @@ def test_many_threads(board: Board) -> None:
 
 
 @pytest.fixture
-def control(clock: Clock) -> Control:
+def control(clock: DrivenClock) -> Control:
     return Control(Session(), 10.0, clock=clock)
 
 
@@ -318,7 +310,7 @@ def test_what_happens_by_itself_is_nobodys(control: Control, event: Event) -> No
 
 
 @pytest.mark.parametrize("teach", [False, True])
-def test_an_arm_that_moves_pauses_when_its_operator_is_gone(control: Control, clock: Clock, teach: bool) -> None:
+def test_an_arm_that_moves_pauses_when_its_operator_is_gone(control: Control, clock: DrivenClock, teach: bool) -> None:
     session = running(control)
     if teach:
         control.apply("ann", Event.TAKE_OVER)
@@ -334,7 +326,7 @@ def test_an_arm_that_moves_pauses_when_its_operator_is_gone(control: Control, cl
     assert not control.check()
 
 
-def test_a_closed_page_pauses_sooner_and_one_that_is_loaded_anew_does_not(control: Control, clock: Clock) -> None:
+def test_a_closed_page_pauses_sooner_and_one_that_is_loaded_anew_does_not(control: Control, clock: DrivenClock) -> None:
     session = running(control)
     control.opened("ann")
     control.opened("ann")
@@ -352,7 +344,7 @@ def test_a_closed_page_pauses_sooner_and_one_that_is_loaded_anew_does_not(contro
     assert session.state is State.PAUSED
 
 
-def test_nobody_at_all_is_absent(clock: Clock) -> None:
+def test_nobody_at_all_is_absent(clock: DrivenClock) -> None:
     session = Session()
     session.apply(Event.START)
     assert Control(session, 10.0, clock=clock).check()
@@ -360,7 +352,7 @@ def test_nobody_at_all_is_absent(clock: Clock) -> None:
 
 
 @pytest.mark.parametrize("state", [State.WAITING, State.PAUSED, State.LABELLING, State.RESETTING, State.STOPPED])
-def test_an_arm_that_rests_needs_nobody(clock: Clock, state: State) -> None:
+def test_an_arm_that_rests_needs_nobody(clock: DrivenClock, state: State) -> None:
     session = Session(state=state)
     assert not Control(session, 10.0, clock=clock).check()
     assert session.state is state

@@ -13,6 +13,8 @@ import pytest
 from cqn_train.operator.keys import TerminalKeys
 from cqn_train.operator.session import Event, Session, State
 
+from ..driven_clock import DrivenClock
+
 
 @pytest.fixture
 def terminal() -> Iterator[tuple[int, io.TextIOWrapper]]:
@@ -22,27 +24,30 @@ def terminal() -> Iterator[tuple[int, io.TextIOWrapper]]:
     os.close(ours)
 
 
-def until(what: object, seconds: float = 10) -> None:
+def until(what: object, seconds: float = 60) -> None:
     deadline = time.monotonic() + seconds
     while not what():
         assert time.monotonic() < deadline
         time.sleep(0.01)
 
 
-def test_a_session_by_keys(terminal: tuple[int, io.TextIOWrapper]) -> None:
+def test_a_session_by_keys(terminal: tuple[int, io.TextIOWrapper], monkeypatch: pytest.MonkeyPatch) -> None:
     ours, stream = terminal
-    session, out = Session(), io.StringIO()
+    pressed, seen, read = b"", bytearray(), os.read
+    monkeypatch.setattr(os, "read", lambda *of: (data := read(*of), seen.extend(data))[0])
+    session, out, clock = Session(), io.StringIO(), DrivenClock()
     before = termios.tcgetattr(stream.fileno())
-    with TerminalKeys(session, stream, out, poll_s=0.01):
+    with TerminalKeys(session, stream, out, poll_s=0.01, clock=clock):
         until(lambda: "space start" in out.getvalue())
         for key, state in [
             (b" ", State.RUNNING), (b"t", State.TEACHING), (b"T", State.RUNNING), (b" ", State.PAUSED),
             (b"\x1b[A", State.PAUSED), (b"s", State.RESETTING), (b"r", State.WAITING), (b"\x1b", State.STOPPED),
         ]:  # fmt: skip
             session._home = False
+            pressed += key
             os.write(ours, key)
-            until(lambda state=state: session.state is state)
-            time.sleep(0.75 if key == b"t" else 0.05)
+            until(lambda state=state, pressed=pressed: session.state is state and seen == pressed)
+            clock.now += 0.75  # pressed again, and not held down
         until(lambda: "run over" in out.getvalue())
     assert termios.tcgetattr(stream.fileno()) == before
     lines = out.getvalue().splitlines()
@@ -129,5 +134,5 @@ def test_ctrl_c_is_still_ctrl_c() -> None:
         os.close(theirs)
         assert b"[waiting]" in program.stderr.readline()
         os.write(ours, b"\x03")
-        assert program.wait(20) == 42
+        assert program.wait(60) == 42
     os.close(ours)

@@ -6,24 +6,12 @@ from hypothesis import strategies as st
 
 from cqn_train.robot.pace import Pace
 
-
-class Clock:
-    """Moves when it is slept on, or told to."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        assert seconds > 0
-        self.now += seconds
+from ..driven_clock import DrivenClock
 
 
-def paced(fps: float = 10.0) -> tuple[Pace, Clock]:
-    clock = Clock()
-    pace = Pace(fps, clock, clock.sleep)
+def paced(fps: float = 10.0) -> tuple[Pace, DrivenClock]:
+    clock = DrivenClock()
+    pace = Pace(fps, clock)
     pace.start()
     return pace, clock
 
@@ -91,6 +79,7 @@ def test_statistics_are_those_of_the_intervals() -> None:
     assert found["late"] == 1
 
 
+@pytest.mark.real_time(reason="the rate on the machine's own clock is what is tested")
 def test_it_keeps_time_by_the_real_clock() -> None:
     pace = Pace(100)
     pace.start()

@@ -1,7 +1,6 @@
 """Limits as properties, and the guard against a robot that misbehaves: judged by what reaches the motors."""
 
 import threading
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +13,8 @@ from hypothesis.extra.numpy import arrays
 from cqn_train.robot.guard import Guard, GuardSettings, RobotFault, StoppedError
 from cqn_train.robot.limits import Limits, allowed_goal
 from lerobot_cqn.errors import ConfigError
+
+from ..driven_clock import DrivenClock, until
 
 D = 3
 NAMES = ("a.pos", "b.pos", "c.pos")
@@ -117,17 +118,9 @@ class Motors:
         return action
 
 
-class Clock:
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
-def guarded(settings: GuardSettings | None = None) -> tuple[Guard, Motors, Clock]:
+def guarded(settings: GuardSettings | None = None) -> tuple[Guard, Motors, DrivenClock]:
     """With a clock of its own and without the watchdog's thread."""
-    motors, clock = Motors(), Clock()
+    motors, clock = Motors(), DrivenClock(0.0)
     motors.connect()
     guard = Guard(motors, limits(), settings or GuardSettings(watchdog_s=1.0), clock)  # type: ignore[arg-type]
     guard.read()
@@ -170,16 +163,15 @@ def test_stop_wins_over_a_goal_that_is_on_its_way() -> None:
     def wait() -> None:
         if not reached.is_set():
             reached.set()
-            go_on.wait(5)
+            clock.wait(go_on, 5)
 
     motors.on_send = wait
-    sender = threading.Thread(target=lambda: guard.send(np.ones(D)))
+    sender = clock.thread(lambda: guard.send(np.ones(D)), "sender")
     sender.start()
-    reached.wait(5)
-    stopper = threading.Thread(target=guard.stop)
+    assert clock.wait(reached, 5)
+    stopper = clock.thread(guard.stop, "stopper")
     stopper.start()
-    while not guard.stopped:
-        time.sleep(0.001)
+    until(clock, lambda: guard.stopped)
     go_on.set()
     sender.join(5)
     stopper.join(5)
@@ -258,14 +250,16 @@ def test_an_arm_that_is_told_to_stay_may_stay() -> None:
 
 
 def test_the_watchdog_holds_an_arm_that_nobody_commands() -> None:
-    motors = Motors()
+    motors, clock = Motors(), DrivenClock()
     settings = GuardSettings(watchdog_s=0.1)
-    with Guard(motors, limits(), settings) as guard:  # type: ignore[arg-type]
+    with Guard(motors, limits(), settings, clock) as guard:  # type: ignore[arg-type]
         assert motors.is_connected
-        time.sleep(0.01)
+        clock.sleep(0.01)
         guard.send(np.ones(D))
         sent = len(motors.goals)
-        time.sleep(0.4)
+        clock.sleep(0.09)
+        assert len(motors.goals) == sent
+        clock.sleep(0.31)
         assert len(motors.goals) == sent + 1  # once
         assert guard.interventions["watchdog"] == 1
         guard.read()
@@ -274,12 +268,29 @@ def test_the_watchdog_holds_an_arm_that_nobody_commands() -> None:
     assert np.array_equal(motors.goals[-1], motors.joints)
 
 
+def test_one_look_of_the_watchdog_at_a_time() -> None:
+    guard, motors, clock = guarded(GuardSettings(watchdog_s=1.0))
+    for moment in (0.0, 5.0):  # no goal was sent yet
+        clock.now += moment
+        guard.watch()
+    assert motors.goals == []
+    guard.send(np.ones(D))
+    clock.now += 1.0
+    guard.watch()
+    assert len(motors.goals) == 1
+    clock.now += 0.001
+    for _ in range(3):
+        guard.watch()
+    assert len(motors.goals) == 2
+    assert guard.interventions["watchdog"] == 1
+
+
 def test_leaving_by_an_error_holds_and_disconnects() -> None:
-    motors = Motors()
+    motors, clock = Motors(), DrivenClock()
 
     def fail() -> None:
-        with Guard(motors, limits()) as guard:  # type: ignore[arg-type]
-            time.sleep(0.01)
+        with Guard(motors, limits(), clock=clock) as guard:  # type: ignore[arg-type]
+            clock.sleep(0.01)
             guard.send(np.ones(D))
             raise ZeroDivisionError
 

@@ -1,14 +1,14 @@
 """The guard as the session of a person uses it: pauses, stops, moving by hand, recovering; judged at the motors."""
 
 import threading
-import time
 
 import numpy as np
 import pytest
 
 from cqn_train.robot.guard import Guard, GuardSettings, HeldError, RobotFault, StoppedError
 
-from .test_robot_guard import Clock, D, Motors, failing, guarded, limits
+from ..driven_clock import DrivenClock
+from .test_robot_guard import D, Motors, failing, guarded, limits
 
 
 def test_no_goal_comes_after_the_hold_of_a_pause() -> None:
@@ -18,7 +18,7 @@ def test_no_goal_comes_after_the_hold_of_a_pause() -> None:
 
     def may_move() -> bool:
         asked.set()
-        go_on.wait(5)
+        clock.wait(go_on, 5)
         return moving[0]
 
     def pause() -> None:
@@ -26,10 +26,10 @@ def test_no_goal_comes_after_the_hold_of_a_pause() -> None:
         guard.hold()
 
     clock.now = 0.1
-    sender = threading.Thread(target=lambda: guard.send(np.ones(D), may_move))
+    sender = clock.thread(lambda: guard.send(np.ones(D), may_move), "sender")
     sender.start()
-    asked.wait(5)
-    pauser = threading.Thread(target=lambda: (time.sleep(0.01), go_on.set(), pause()))
+    assert clock.wait(asked, 5)
+    pauser = clock.thread(lambda: (clock.sleep(0.01), go_on.set(), pause()), "pauser")
     pauser.start()
     sender.join(5)
     pauser.join(5)
@@ -45,15 +45,15 @@ def test_no_goal_comes_after_the_hold_of_a_pause() -> None:
 
 def test_refusing_waits_for_nothing() -> None:
     """A reading that hangs has the lock: the stop comes through all the same, and holds once it can."""
-    guard, motors, _ = guarded()
+    guard, motors, clock = guarded()
     hangs, go_on = threading.Event(), threading.Event()
-    motors.on_read = lambda _: (hangs.set(), go_on.wait(5))[0]  # type: ignore[func-returns-value]
-    reader = threading.Thread(target=guard.read)
+    motors.on_read = lambda _: (hangs.set(), clock.wait(go_on, 5))[0]  # type: ignore[func-returns-value]
+    reader = clock.thread(guard.read, "reader")
     reader.start()
-    hangs.wait(5)
-    begun = time.monotonic()
+    assert clock.wait(hangs, 5)
+    begun = clock.now
     guard.refuse()
-    assert time.monotonic() - begun < 1
+    assert clock.now == begun
     assert guard.stopped
     assert motors.goals == []
     go_on.set()
@@ -148,7 +148,7 @@ def test_recovering_connects_again_and_holds_where_the_arm_is_found() -> None:
 
 
 def test_an_arm_that_is_found_outside_its_limits_is_held_there() -> None:
-    motors, clock = Motors(), Clock()
+    motors, clock = Motors(), DrivenClock()
     motors.connect()
     motors.joints = np.array([130.0, 0.0, -130.0])
     guard = Guard(motors, limits(), GuardSettings(), clock)  # type: ignore[arg-type]

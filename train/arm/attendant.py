@@ -2,13 +2,13 @@
 
 import contextlib
 import threading
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..clock import REAL, Clock
 from ..operator.session import IN_MOTION, Event, RefusedError, Session, State
 from ..robot.arm import Arm
 from ..robot.guard import HeldError, RobotFault, StoppedError
@@ -24,16 +24,23 @@ class Attendant:
     """Follows the session in a thread of its own; every change reaches it at once.
 
     Attributes:
-        changed: notified whenever the session has changed, for whoever waits for it.
+        changed: set whenever the session has changed, for the one who waits for it and clears it.
     """
 
-    def __init__(self, arm: Arm, session: Session, show: Callable[[Mapping[str, NDArray[np.uint8]]], Any]) -> None:
-        self.arm, self.session, self._show = arm, session, show
-        self.changed = threading.Condition()
+    def __init__(
+        self,
+        arm: Arm,
+        session: Session,
+        show: Callable[[Mapping[str, NDArray[np.uint8]]], Any],
+        clock: Clock = REAL,
+    ) -> None:
+        self.arm, self.session, self._show, self._clock = arm, session, show, clock
+        self.changed = threading.Event()
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._homeward = False
-        self._thread = threading.Thread(target=self._run, name="attendant", daemon=True)
+        self._before = session.state
+        self._thread = clock.thread(self._run, "attendant")
         self._tell = session.on_change
         session.on_change = self._on_change
 
@@ -65,25 +72,28 @@ class Attendant:
         if session.state in (*IN_MOTION, State.FAULTED):
             self._homeward = False  # after a fault the arm does not set off by itself while it is looked after
         self._wake.set()
-        with self.changed:
-            self.changed.notify_all()
+        self.changed.set()
         self._tell(session)
 
     def _run(self) -> None:
-        before = self.session.state
+        self._before = self.session.state
         while not self._closing.is_set():
-            self._wake.wait(1 / LOOK_HZ)
+            self._clock.wait(self._wake, 1 / LOOK_HZ)
             self._wake.clear()
-            state = self.session.state
-            try:
-                self._attend(state, before)
-            except (HeldError, StoppedError):  # somebody else has taken over
-                pass
-            except RobotFault as error:
-                self.fault(error)
-            except Exception as error:  # without this thread nobody would hold the arm
-                self.fault(RobotFault(f"Looking after the arm failed: {error!r}"))
-            before = state
+            self.turn()
+
+    def turn(self) -> None:
+        """One look at the session, and what it asks for; raises nothing."""
+        state = self.session.state
+        try:
+            self._attend(state, self._before)
+        except (HeldError, StoppedError):  # somebody else has taken over
+            pass
+        except RobotFault as error:
+            self.fault(error)
+        except Exception as error:  # without this thread nobody would hold the arm
+            self.fault(RobotFault(f"Looking after the arm failed: {error!r}"))
+        self._before = state
 
     def _attend(self, state: State, before: State) -> None:
         guard = self.arm.guard
@@ -112,7 +122,7 @@ class Attendant:
             while self._homeward and not self._closing.is_set() and not self.session.free:
                 self._show(self.arm.guard.read().pictures)
                 self._homeward = not self.arm.step_home(lambda: self.session.state in BETWEEN)
-                time.sleep(1 / self.arm.fps)
+                self._clock.sleep(1 / self.arm.fps)
             self._homeward = False
             self.arm.guard.hold()
         finally:
@@ -124,7 +134,7 @@ class Attendant:
         except RobotFault as error:
             if self.session.fault != str(error):
                 self.fault(error)
-            self._closing.wait(RETRY_S)
+            self._clock.wait(self._closing, RETRY_S)
             return
         with contextlib.suppress(RefusedError):  # stopped meanwhile
             self.session.apply(Event.RECOVERED)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from lerobot_cqn.errors import ConfigError, DataError, one_of
 
 from ..agent import Agent
+from ..clock import REAL, Clock
 from ..config import RunConfig
 from ..interfaces import PAGE_TOKEN
 from ..operator.board import Board
@@ -55,6 +56,7 @@ def make_operated(
     demonstrations: Demonstrations | None,
     should_stop: Callable[[], bool],
     say: Callable[[str], None],
+    clock: Clock = REAL,
 ) -> Operated:
     """Robot, leader and session, checked to fit the policy; nothing is connected yet.
 
@@ -74,20 +76,20 @@ def make_operated(
     _check_home(home, names, limits)
     settings = GuardSettings(config.arm.stale_s, config.arm.watchdog_s)
     clutched = [i for i, name in enumerate(names) if "gripper" not in name]
-    arm = Arm(Guard(robot, limits, settings), config.arm, fps, leader=leader, clutched=clutched, home=home)
+    arm = Arm(Guard(robot, limits, settings, clock), config.arm, fps, leader=leader, clutched=clutched, home=home)
     if agent.deltas is None:
         say(
             "Warning: the policy's actions are absolute goals, which may lie far from the arm; on real arms learn "
             "differences (cqn-data delta, or the recipe paper_real_world)."
         )
     session = Session(leader=leader is not None, can_free=arm.guard.can_release)
-    board = Board(session)
+    board = Board(session, clock=clock)
     if config.arm.on_exit == "hold" and getattr(robot_config, "disable_torque_on_disconnect", False):
         say(
             "Warning: this robot lets its motors go when it is disconnected, so the arm falls at the end of the run: "
             "give --robot.disable_torque_on_disconnect=false to hold it."
         )
-    return Operated(ArmEnvironment(arm, session, board, should_stop), session, board)
+    return Operated(ArmEnvironment(arm, session, board, should_stop, clock), session, board)
 
 
 @contextlib.contextmanager

@@ -1,7 +1,6 @@
 """Episodes on a real arm with a person: what the session says becomes steps of the loop."""
 
 import contextlib
-import time
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
@@ -9,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..clock import REAL, Clock
 from ..interfaces import Frame, Interrupted, Label, Outcome
 from ..operator.session import IN_MOTION, Event, RefusedError, Session, State
 from ..robot.arm import Arm
@@ -52,12 +52,17 @@ class ArmEnvironment:
     """
 
     def __init__(
-        self, arm: Arm, session: Session, display: Display, should_stop: Callable[[], bool] = lambda: False
+        self,
+        arm: Arm,
+        session: Session,
+        display: Display,
+        should_stop: Callable[[], bool] = lambda: False,
+        clock: Clock = REAL,
     ) -> None:
-        self.arm, self.session, self.display = arm, session, display
+        self.arm, self.session, self.display, self._clock = arm, session, display, clock
         self._should_stop = should_stop
-        self._attendant = Attendant(arm, session, display.show)
-        self._pace = Pace(arm.fps)
+        self._attendant = Attendant(arm, session, display.show, clock)
+        self._pace = Pace(arm.fps, clock)
         self._steps, self._began = 0, 0.0
         self._frame: Frame = {}
         self._pictures: Mapping[str, NDArray[np.uint8]] = {}
@@ -93,7 +98,7 @@ class ArmEnvironment:
         # An episode may be over, or paused, before this thread has seen that it began.
         self._wait(lambda: self.session.state in IN_MOTION or self._episode() != before)
         self.arm.let_go()
-        self._steps, self._began = 0, time.monotonic()
+        self._steps, self._began = 0, self._clock.now
         self.display.begin_episode(self.session.episode)
         try:
             self.arm.guard.engage()  # where it was let go to be moved by hand
@@ -196,7 +201,7 @@ class ArmEnvironment:
             return Outcome(frame=frame, reward=0.0, terminated=False, truncated=False, success=False, skipped=True)
 
     def _ended(self, frame: Frame, label: Label, *, out_of_time: bool, **more: Any) -> Outcome:
-        self.display.end_episode(self.session.episode, self._steps, time.monotonic() - self._began)
+        self.display.end_episode(self.session.episode, self._steps, self._clock.now - self._began)
         success, discarded = label is Label.SUCCESS, label is Label.DISCARD
         # A person's "failure" ends the task; out of time, the value of what was reached still counts.
         terminated = success or (label is Label.FAILURE and not out_of_time)
@@ -220,12 +225,14 @@ class ArmEnvironment:
 
     def _wait(self, ready: Callable[[], bool]) -> None:
         """Until something is so. Raises Interrupted after a stop of the person or of the process."""
-        began = time.monotonic()
+        began, changed = self._clock.now, self._attendant.changed
         try:
-            while not ready():
+            while True:
+                changed.clear()  # before looking: what changes from now on is seen at once
+                if ready():
+                    return
                 if self._should_stop() or self.session.state is State.STOPPED:
                     raise Interrupted
-                with self._attendant.changed:
-                    self._attendant.changed.wait(LOOK_S)
+                self._clock.wait(changed, LOOK_S)
         finally:
-            self._waited_s += time.monotonic() - began
+            self._waited_s += self._clock.now - began

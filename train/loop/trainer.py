@@ -1,7 +1,6 @@
 """The loop: offline updates on the demonstrations, then acting and learning (Algorithm 2)."""
 
 import contextlib
-import time
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -13,6 +12,7 @@ from lerobot_cqn.learner import Learner, NonFiniteLossError
 from lerobot_cqn.schema import Batch
 
 from ..agent import Agent
+from ..clock import REAL, Clock
 from ..config import RunConfig
 from ..interfaces import Environment, Interrupted, Label, Monitor, Outcome, Person, Scenes
 from ..replay.buffer import Replay
@@ -52,7 +52,11 @@ class Trainer:
     finished_since: Sequence[Place] = ()
     _aside: dict[int, tuple[Episode, dict[str, Any]]] = field(default_factory=dict)
     _recent: list[bool] = field(default_factory=list)
-    _clock: float = field(default_factory=time.monotonic)
+    clock: Clock = REAL
+    _counted_at: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._counted_at = self.clock.now
 
     def run(self) -> None:
         """Offline phase, online phase, final evaluation. Raises Interrupted between two updates or steps."""
@@ -81,7 +85,7 @@ class Trainer:
         c = self.counters
         self.monitor.phase("online", self.config.steps, c.env_steps)
         while c.env_steps < self.config.steps and not self._out_of_time():
-            before, number, began, waited = c.env_steps, c.episodes, time.monotonic(), self.env.waited_s
+            before, number, began, waited = c.env_steps, c.episodes, self.clock.now, self.env.waited_s
             try:
                 self.episode()
             except Interrupted:  # the unfinished episode is dropped, so its steps do not count either
@@ -89,7 +93,7 @@ class Trainer:
                 raise
             self._relabel()
             self.updates(self.config.recipe.updates_per_episode, on_update=self._tell_updates)
-            c.online_s += time.monotonic() - began - (self.env.waited_s - waited)
+            c.online_s += self.clock.now - began - (self.env.waited_s - waited)
             self._look_and_save(before)
 
     def _look_and_save(self, before: int) -> None:
@@ -263,8 +267,8 @@ class Trainer:
         self.monitor.message(f"{phase:>8}  step {self.counters.env_steps:>6}  {result}")
 
     def _progress(self) -> dict[str, float]:
-        now = time.monotonic()
-        self.counters.wall_s += now - self._clock
-        self._clock = now
+        now = self.clock.now
+        self.counters.wall_s += now - self._counted_at
+        self._counted_at = now
         c = self.counters
         return {"env_steps": c.env_steps, "updates": c.updates, "wall_s": round(c.wall_s, 2)}

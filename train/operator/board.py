@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..clock import REAL, Clock
 from .films import Films, Picture, is_picture, to_jpeg
 from .session import IN_EPISODE, IN_MOTION, Label, Session, State
 
@@ -43,17 +44,9 @@ class Board:
     out, without an error. Episodes have the session's numbers everywhere, also in the rows given to `log`.
 
     film_hz: pictures a second in an episode's film. kept_films: finished episodes whose film is kept.
-    clock: seconds that never go back.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        *,
-        film_hz: float = 5.0,
-        kept_films: int = 5,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, session: Session, *, film_hz: float = 5.0, kept_films: int = 5, clock: Clock = REAL) -> None:
         self.session = session
         self._films = Films(film_hz, kept_films)
         self._clock = clock
@@ -70,7 +63,7 @@ class Board:
         self._learner: dict[str, float | None] = {}
         self._ended: dict[int, tuple[int | None, float | None]] = {}
         self._episode: tuple[int, float, float | None] | None = None  # number, began, seconds once it has ended
-        self._began = clock()
+        self._began = clock.now
         # Written with the session's lock held, so without one of our own: each is replaced as a whole.
         self._since = (session.state, self._began)
         self._busy_since = (getattr(session, "busy", ""), self._began)
@@ -90,7 +83,7 @@ class Board:
                 self._refused.add(str(name))
                 found = f"{getattr(picture, 'dtype', type(picture).__name__)} {getattr(picture, 'shape', '')}".strip()
                 self.message(f"Camera {name} is not shown: expected uint8 [H, W, 3], found {found}.")
-        now = self._clock()
+        now = self._clock.now
         with self._lock:
             self._pictures.update(good)
             self._shown.update(dict.fromkeys(good, now))
@@ -100,7 +93,7 @@ class Board:
     def begin_episode(self, number: int) -> None:
         """An episode begins: its time runs, and a film of it is made."""
         with self._lock:
-            self._episode = (int(number), self._clock(), None)
+            self._episode = (int(number), self._clock.now, None)
         self._films.begin(int(number))
 
     def end_episode(self, number: int, steps: int, seconds: float) -> None:
@@ -108,7 +101,7 @@ class Board:
         self._films.end()
         count, length = _plain(steps), _plain(seconds)
         with self._lock:
-            began = self._episode[1] if self._episode else self._clock()
+            began = self._episode[1] if self._episode else self._clock.now
             self._episode = (int(number), began, length if isinstance(length, int | float) else None)
             self._ended.pop(int(number), None)  # the order is that of their ends
             self._ended[int(number)] = (
@@ -126,7 +119,7 @@ class Board:
         """A phase of `total` units begins, `done` of them already behind."""
         units = _number(done)
         with self._lock:
-            self._phase = _Phase(str(name), _number(total), units, self._clock(), units)
+            self._phase = _Phase(str(name), _number(total), units, self._clock.now, units)
 
     def advance(self, done: int, note: str) -> None:
         """Progress within the phase."""
@@ -196,7 +189,7 @@ class Board:
     def snapshot(self) -> dict[str, Any]:
         """Everything as plain JSON values, times in seconds; what is not a finite number is None."""
         session = self.session.snapshot()  # before our own lock: one is never asked for while the other is held
-        films, now = self._films.cameras(), self._clock()
+        films, now = self._films.cameras(), self._clock.now
         with self._lock:
             shown, health, phase = dict(self._shown), dict(self._health), self._phase
             lines, rows, evaluations = list(self._lines), dict(self._rows), list(self._evaluations)
@@ -220,7 +213,7 @@ class Board:
         }
 
     def _changed(self, session: Session) -> None:
-        now, busy = self._clock(), getattr(session, "busy", "")
+        now, busy = self._clock.now, getattr(session, "busy", "")
         if session.state is not self._since[0]:
             self._since = (session.state, now)
         if busy != self._busy_since[0]:

@@ -1,13 +1,13 @@
 """Who of those at the pages is the operator, and whether anybody is there: no web in it."""
 
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
 from lerobot_cqn.errors import CQNError
 
+from ..clock import REAL, Clock
 from .session import BY_ITSELF, IN_MOTION, Event, Label, RefusedError, Session, State
 
 __all__ = ["Control", "ViewingOnlyError"]
@@ -26,7 +26,6 @@ class Control:
     `absent_s` seconds, and within LEFT_S after closing the page; otherwise `check` lets the session pause.
 
     said: called with a line for people when control changes hands or nobody is there.
-    clock: seconds that never go back.
     """
 
     def __init__(
@@ -35,7 +34,7 @@ class Control:
         absent_s: float = 10.0,
         *,
         said: Callable[[str], None] = lambda _: None,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Clock = REAL,
     ) -> None:
         self._session, self._absent_s, self._said, self._clock = session, absent_s, said, clock
         self._operator: str | None = None
@@ -50,7 +49,7 @@ class Control:
             if self._operator is None:
                 self._operator = client
             if client == self._operator:
-                self._seen, self._gone = self._clock(), False
+                self._seen, self._gone = self._clock.now, False
 
     def opened(self, client: str) -> None:
         """A page of this client is connected."""
@@ -65,7 +64,7 @@ class Control:
             if self._pages[client] <= 0:
                 del self._pages[client]
                 if client == self._operator:
-                    self._left, self._gone = self._clock(), True
+                    self._left, self._gone = self._clock.now, True
 
     def take(self, client: str) -> None:
         """Make this client the operator."""
@@ -114,7 +113,7 @@ class Control:
     def present(self) -> bool:
         """Whether there is an operator who has been seen lately."""
         with self._lock:
-            now = self._clock()
+            now = self._clock.now
             if self._operator is None or now - self._seen > self._absent_s:
                 return False
             return not (self._gone and now - self._left > min(LEFT_S, self._absent_s))

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Self, TextIO
 
+from ..clock import REAL, Clock
 from .session import Event, RefusedError, Session, State
 
 __all__ = ["KEYS", "TerminalKeys"]
@@ -33,9 +34,14 @@ class TerminalKeys:
     """
 
     def __init__(
-        self, session: Session, stream: TextIO | None = None, out: TextIO | None = None, poll_s: float = 0.1
+        self,
+        session: Session,
+        stream: TextIO | None = None,
+        out: TextIO | None = None,
+        poll_s: float = 0.1,
+        clock: Clock = REAL,
     ) -> None:
-        self._session, self._poll_s = session, poll_s
+        self._session, self._poll_s, self._clock = session, poll_s, clock
         self._stream = stream if stream is not None else sys.stdin
         self._out = out if out is not None else sys.stderr
         self._leave = threading.Event()
@@ -95,7 +101,6 @@ class TerminalKeys:
 
     def _run(self) -> None:
         import select
-        import time
 
         descriptor = self._stream.fileno()
         try:
@@ -111,7 +116,7 @@ class TerminalKeys:
                 if len(data) > 1 and data[0] == 0x1B:
                     continue
                 for key in data.decode(errors="ignore"):
-                    self.press(key, time.monotonic())
+                    self.press(key, self._clock.now)
             self._tell()
         except (OSError, ValueError):
             self._say("Keys are off: the terminal is gone.")

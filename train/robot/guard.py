@@ -2,7 +2,6 @@
 
 import contextlib
 import threading
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.errors import CQNError
 
+from ..clock import REAL, Clock
 from .limits import Limits, allowed_goal
 
 __all__ = ["Guard", "GuardSettings", "Reading", "RobotFault", "StoppedError"]
@@ -68,23 +68,19 @@ class Guard:
     """
 
     def __init__(
-        self,
-        robot: Robot,
-        limits: Limits,
-        settings: GuardSettings | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        self, robot: Robot, limits: Limits, settings: GuardSettings | None = None, clock: Clock = REAL
     ) -> None:
         self.robot, self.limits, self.settings = robot, limits, settings or GuardSettings()
         self.names = tuple(robot.action_features)
         self.interventions: dict[str, int] = {}
         self._clock = clock
-        self._lock = threading.RLock()
+        self._lock = clock.lock()
         self._stopped = threading.Event()
         self._closing = threading.Event()
         self._goal: Array | None = None
         self._measured: Array | None = None
         self._trusted = True  # whether the joints that were read last can be believed
-        self._sent_at = self._asked_at = self._read_at = clock()
+        self._sent_at = self._asked_at = self._read_at = clock.now
         self._held, self._released = True, False
         self._changed_at: dict[str, float] = {}
         self._before: dict[str, Any] = {}
@@ -109,7 +105,7 @@ class Guard:
         except Exception as error:  # drivers raise many kinds
             raise RobotFault(f"The robot cannot be connected: {error} Check cables, power and --robot.port.") from error
         self.read()
-        self._watchdog = threading.Thread(target=self._watch, name="watchdog", daemon=True)
+        self._watchdog = self._clock.thread(self._run, "watchdog")
         self._watchdog.start()
 
     def close(self, *, release: bool = False) -> None:
@@ -130,13 +126,13 @@ class Guard:
     def read(self) -> Reading:
         """Joints and pictures. Raises RobotFault when it fails, takes too long, or is not finite, or stale."""
         with self._lock:
-            begun = self._clock()
+            begun = self._clock.now
             try:
                 raw = self.robot.get_observation()
                 joints = np.array([float(raw[name]) for name in self.names])
             except Exception as error:  # drivers raise many kinds, or leave a joint out
                 raise RobotFault(f"The robot cannot be read: {error} Check cables and power.") from error
-            now = self._clock()
+            now = self._clock.now
             if now - begun > self.settings.slow_s:
                 raise RobotFault(
                     f"Reading the robot took {now - begun:.1f} s, expected at most {self.settings.slow_s:g} s."
@@ -192,7 +188,7 @@ class Guard:
                 raise StoppedError("The arm was stopped: start again to move it.")
             if self._released or not may_move():
                 raise HeldError("The arm may not move now.")
-            now = self._clock()
+            now = self._clock.now
             if self._measured is None or self._goal is None:
                 self.read()
             assert self._measured is not None and self._goal is not None  # noqa: S101, PT018  # read sets both
@@ -287,14 +283,17 @@ class Guard:
             self.robot.send_action({name: float(value) for name, value in zip(self.names, goal, strict=True)})
         except Exception as error:  # drivers raise many kinds
             raise RobotFault(f"The robot takes no goal: {error} Check cables and power.") from error
-        self._goal, self._sent_at = goal, self._clock()
+        self._goal, self._sent_at = goal, self._clock.now
 
-    def _watch(self) -> None:
-        """Hold the arm when nobody has sent a goal for too long, whatever the reason."""
-        while not self._closing.wait(self.settings.watchdog_s / 5):
-            # Without the lock: a reading that hangs must not blind the watchdog, only delay its goal.
-            if not self._held and self._clock() - self._asked_at > self.settings.watchdog_s:
-                self.interventions["watchdog"] = self.interventions.get("watchdog", 0) + 1
-                with self._lock, contextlib.suppress(RobotFault):
-                    if not self._held:
-                        self._hold()
+    def _run(self) -> None:
+        while not self._clock.wait(self._closing, self.settings.watchdog_s / 5):
+            self.watch()
+
+    def watch(self) -> None:
+        """One look of the watchdog: hold the arm when nobody has sent a goal for too long, whatever the reason."""
+        # Without the lock: a reading that hangs must not blind the watchdog, only delay its goal.
+        if not self._held and self._clock.now - self._asked_at > self.settings.watchdog_s:
+            self.interventions["watchdog"] = self.interventions.get("watchdog", 0) + 1
+            with self._lock, contextlib.suppress(RobotFault):
+                if not self._held:
+                    self._hold()

@@ -1,11 +1,10 @@
 """A fixed control rate, and how well it is kept."""
 
-import time
 from collections import deque
-from collections.abc import Callable
 
 import numpy as np
-from lerobot.utils.robot_utils import precise_sleep
+
+from ..clock import REAL, Clock
 
 __all__ = ["Pace"]
 
@@ -17,29 +16,24 @@ class Pace:
         late: ticks that came more than a tenth of a period too late.
     """
 
-    def __init__(
-        self,
-        fps: float,
-        clock: Callable[[], float] = time.perf_counter,
-        sleep: Callable[[float], object] = precise_sleep,
-    ) -> None:
+    def __init__(self, fps: float, clock: Clock = REAL) -> None:
         self.period = 1.0 / fps
         self.late = 0
-        self._clock, self._sleep = clock, sleep
+        self._clock = clock
         self._next = self._last = 0.0
         self._intervals: deque[float] = deque(maxlen=1000)
 
     def start(self) -> None:
         """Begin to count: the first tick comes a period from now. After a break, call it again."""
-        self._last = self._clock()
+        self._last = self._clock.now
         self._next = self._last + self.period
 
     def wait(self) -> None:
         """Wait for the next tick; one that is missed by more than a period is left out, not caught up."""
-        left = self._next - self._clock()
+        left = self._next - self._clock.now
         if left > 0:
-            self._sleep(left)
-        now = self._clock()
+            self._clock.sleep(left)
+        now = self._clock.now
         self._intervals.append(now - self._last)
         self.late += now - self._next > 0.1 * self.period
         self._last = now

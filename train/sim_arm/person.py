@@ -3,7 +3,6 @@
 import json
 import os
 import threading
-import time
 import urllib.error
 import urllib.request
 from typing import Any
@@ -14,6 +13,7 @@ from .world import World
 __all__ = ["SimPerson"]
 
 LOOK_S = 0.03
+RETRY_S = 0.2
 SURE_S = 0.2  # simulated seconds for which the task must look done
 
 
@@ -34,7 +34,7 @@ class SimPerson:
         self.helps_episodes = helps_episodes
         self._closing = threading.Event()
         self._state, self._since, self._done_at = "", 0.0, -1.0
-        self._thread = threading.Thread(target=self._run, name="simulated-person", daemon=True)
+        self._thread = world.clock.thread(self._run, "simulated-person")
 
     def start(self) -> None:
         """Begin to watch."""
@@ -45,11 +45,11 @@ class SimPerson:
         self._closing.set()
 
     def _run(self) -> None:
-        while not self._closing.wait(LOOK_S):
+        while not self.world.clock.wait(self._closing, LOOK_S):
             try:
                 self._look()
             except (OSError, ValueError, KeyError):  # no page yet, or no more: look again
-                time.sleep(0.2)
+                self.world.clock.sleep(RETRY_S)
 
     def _look(self) -> None:
         seen = self._ask("/api/state")

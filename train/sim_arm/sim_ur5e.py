@@ -1,6 +1,5 @@
 """The simulated UR5e as a LeRobot robot, with the faults that real ones have."""
 
-import time
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.errors import ConfigError
 
+from ..clock import REAL, Clock
 from ..envs.ur5e_station.tasks import TASKS
 from ..envs.ur5e_station.ur5e import STATE_NAMES
 from .config_sim_ur5e import SimUR5eConfig
@@ -34,9 +34,14 @@ def from_robot_units(values: dict[str, Any]) -> tuple[NDArray[np.float64], float
 
 
 class SimUR5e(Robot):
-    """The arm of the simulated station: absolute joint goals in degrees, four cameras, time that does not wait."""
+    """The arm of the simulated station: absolute joint goals in degrees, four cameras, time that does not wait.
+
+    Attributes:
+        clock: by which its world runs once it is connected.
+    """
 
     config_class = SimUR5eConfig
+    clock: Clock = REAL
     name = "sim_ur5e"
 
     def __init__(self, config: SimUR5eConfig) -> None:
@@ -85,7 +90,7 @@ class SimUR5e(Robot):
         c = self.config
         if c.world in WORLDS:
             raise ConfigError(f"There is an arm in the world '{c.world}' already: give another --robot.world.")
-        self._world = WORLDS[c.world] = World(c.task, c.speed, c.ramp_s, c.seed)
+        self._world = WORLDS[c.world] = World(c.task, c.speed, c.ramp_s, c.seed, self.clock)
         if c.person:
             self._person = SimPerson(self._world, c.person, c.person_takes_over_s, c.person_helps_episodes)
             self._person.start()
@@ -103,7 +108,7 @@ class SimUR5e(Robot):
             world.catch_up()
             self._fail("disconnect", "error")
             for fault in self._on("delay"):
-                time.sleep(fault.amount)
+                world.clock.sleep(fault.amount)
                 world.catch_up()
             joints = to_robot_units(world.arm.joints, world.arm.closure)
             if self.config.state:

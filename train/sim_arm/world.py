@@ -1,7 +1,5 @@
 """The simulated world that a robot and a leader in one process share: it runs by a clock of its own."""
 
-import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -11,6 +9,7 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.errors import ConfigError, one_of
 
+from ..clock import Clock
 from ..envs.cameras import Cameras
 from ..envs.ur5e_station.station import LEASH, MAX_JOINT_SPEED
 from ..envs.ur5e_station.task import Task
@@ -51,12 +50,12 @@ class World:
 
     fps = 10
 
-    def __init__(self, task: str, speed: float, ramp_s: float, seed: int) -> None:
+    def __init__(self, task: str, speed: float, ramp_s: float, seed: int, clock: Clock) -> None:
         self.station_task: Task = TASKS[task]()
         self.arm = Arm(self.station_task.mjcf())
         self._cameras = Cameras(self.arm.model)
         self._painter = ThreadPoolExecutor(1, "painter")  # a graphics context belongs to one thread; a robot to all
-        self.lock = threading.RLock()
+        self.clock, self.lock = clock, clock.lock()
         limits = np.array([MAX_JOINT_SPEED / self.fps] * 6 + [1.0], np.float32)
         self.action_space = gym.spaces.Box(np.append(-limits[:6], np.float32(0.0)), limits, dtype=np.float32)
         self.speed, self.ramp_s = speed, ramp_s
@@ -64,7 +63,7 @@ class World:
         self._stuck: tuple[int, float] | None = None
         self.fastest = 0.0
         self._rng = np.random.default_rng(seed)
-        self._clock = time.monotonic()
+        self._looked = clock.now
         self._left, self._rested = False, 0.0
         self._succeeded = False
         self.arm.place(np.array(HOME), self.station_task.start_closure)
@@ -130,11 +129,11 @@ class World:
     def catch_up(self) -> None:
         """Let the time since the last look happen."""
         with self.lock:
-            real = time.monotonic()
-            passed = min(real - self._clock, _BEHIND_S) * self.speed
+            real = self.clock.now
+            passed = min(real - self._looked, _BEHIND_S) * self.speed
             steps = int(passed / TIMESTEP)
             # What is less than a physics step is left for the next look.
-            self._clock = real - (passed - steps * TIMESTEP) / self.speed
+            self._looked = real - (passed - steps * TIMESTEP) / self.speed
             for _ in range(steps):
                 self._step()
 
@@ -161,11 +160,11 @@ class World:
             self.lay_out()
 
     def until(self, condition: Callable[[], bool], seconds: float) -> bool:
-        """Let real time pass until a condition holds; whether it did within `seconds`."""
-        deadline = time.monotonic() + seconds
+        """Let time pass until a condition holds; whether it did within so many seconds of the clock."""
+        deadline = self.clock.now + seconds
         while not condition():
-            if time.monotonic() > deadline:
+            if self.clock.now > deadline:
                 return False
-            time.sleep(0.005)
+            self.clock.sleep(0.005)
             self.catch_up()
         return True

@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 from lerobot_cqn.errors import ConfigError
 
+from ...clock import REAL, Clock
 from ..board import Board
 from ..control import Control
 from .access import ANY_ADDRESS
@@ -34,13 +35,19 @@ class OperatorServer:
     """
 
     def __init__(
-        self, board: Board, host: str = "127.0.0.1", port: int = 0, token: str | None = None, absent_s: float = 10.0
+        self,
+        board: Board,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        token: str | None = None,
+        absent_s: float = 10.0,
+        clock: Clock = REAL,
     ) -> None:
         need_extra()
         if token is not None and len(token) < MIN_TOKEN:
             raise ConfigError(f"The page's token has {len(token)} characters: expected at least {MIN_TOKEN}.")
         self.host, self.token = host, token if token is not None else secrets.token_urlsafe(16)
-        self.control = Control(board.session, absent_s, said=board.message)
+        self.control = Control(board.session, absent_s, said=board.message, clock=clock)
         app = make_app(board, self.token, self.control, host=host, check_s=min(0.25, absent_s / 4))
         self._socket = _listen(host, port)
         self.port: int = self._socket.getsockname()[1]
