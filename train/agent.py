@@ -72,7 +72,7 @@ class Agent:
 
     @property
     def deltas(self) -> DeltaJoints | None:
-        """Which of the policy's actions are differences that the postprocessor turns into goals; None: none."""
+        """Differences among the policy's actions that the postprocessor turns into goals; None: none."""
         return next((step.deltas for step in self._goal_steps), None)
 
     @property
@@ -100,7 +100,7 @@ class Agent:
         return None
 
     def inside(self, bounds: Mapping[str, NDArray[Any]] | None) -> NDArray[Any]:
-        """Which action dimensions [D] end before the environment's bounds (`min`, `max`) do: more is possible."""
+        """Action dimensions [D], as flags, that end before the environment's bounds (`min`, `max`) do: more is possible."""
         if bounds is None:
             return np.ones(self.policy.action_dims, dtype=bool)
         (scale,) = (step for step in self.postprocessor.steps if isinstance(step, UnnormalizerProcessorStep))

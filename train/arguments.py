@@ -73,7 +73,7 @@ LAST = (
 
 
 def introduction() -> str:
-    """What `--help` begins with: examples, and the presets by name."""
+    """Beginning of `--help`: examples, and the presets by name."""
     lines = [
         f"  --policy.type={policy:<6} {name:<18} {what}"
         for policy, names in PRESETS.items()

@@ -43,7 +43,7 @@ Bounds = Mapping[str, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """What is acted in, to learn and to evaluate, and the person beside it.
+    """Environment to learn and to evaluate in, and the person beside it.
 
     bounds: `min` and `max` [D] of the environment's action, None where it has none; board: what the person is shown.
     """
@@ -239,7 +239,7 @@ def load_demonstrations(
 
 
 def also_to(run: ValidRun, board: Board | None) -> list[Log]:
-    """Where metrics go besides their files."""
+    """Places that metrics go to besides their files."""
     config = run.config
     also: list[Log] = [] if board is None else [board.log]
     if config.tensorboard:

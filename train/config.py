@@ -29,7 +29,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a run learns, where the paper gives each method numbers of its own; the defaults are CQN's on RLBench."""
+    """Schedule of a run, where the paper gives each method numbers of its own; the defaults are CQN's on RLBench."""
 
     updates_per_step: int = number(1, least=0)  # after each control step
     updates_per_episode: int = number(0, least=0)  # between episodes
@@ -75,7 +75,7 @@ class EvalSettings:
 
 @dataclass
 class ReplaySettings:
-    """Where experience is kept: in output_dir/replay, on disk, so that a kill loses no finished episode."""
+    """The replay on disk, in output_dir/replay, on disk, so that a kill loses no finished episode."""
 
     # of the demonstrations and the run's episodes together; the oldest make room
     capacity_gib: float = number(16.0, above=0)

@@ -1,4 +1,4 @@
-"""What the loop needs from the world; environments and arms meet it here, and only here."""
+"""Protocols and records in which the loop meets environments and arms, and the only place where it does."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class Interrupted(Exception):  # noqa: N818  # a request, not an error
 
 
 class Label(StrEnum):
-    """How an episode went, in a person's judgement."""
+    """Judgement of an episode by a person."""
 
     SUCCESS = "success"
     FAILURE = "failure"
@@ -41,7 +41,7 @@ class Label(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What one control step brought.
+    """Outcome of one control step.
 
     frame: the new observation under LeRobot's names, one batch dimension of 1.
     terminated: a real end (success); truncated: out of time, the value of the last observation still counts.
@@ -106,7 +106,7 @@ class Environment(Protocol):
 
 
 class Person(Protocol):
-    """Who judges episodes and may change their mind, as the loop sees them."""
+    """The person who judges episodes and may change their mind, as the loop sees them."""
 
     def expect(self, number: int | None) -> None:
         """Say which episode of the run starts next; None: evaluations."""
@@ -122,7 +122,7 @@ class Person(Protocol):
 
 
 class Monitor(Protocol):
-    """What a person sees while it runs."""
+    """Display of progress for a person."""
 
     def phase(self, name: str, total: int, done: int) -> None:
         """A phase of `total` units begins, `done` of them already behind."""
@@ -141,10 +141,10 @@ class Nobody:
     """The person of an environment that judges for itself."""
 
     def expect(self, number: int | None) -> None:
-        """There is nobody to tell."""
+        """Nothing: there is nobody to tell."""
 
     def learning(self, doing: str) -> None:
-        """There is nobody to tell."""
+        """Nothing: there is nobody to tell."""
 
     def take_relabelled(self) -> dict[int, Label]:
         """Nothing."""
@@ -153,7 +153,7 @@ class Nobody:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcomes:
-    """What one control step brought in K scenes; `frame` has K rows, the arrays are [K]. skipped: as in `Outcome`."""
+    """Outcome of one control step in K scenes; `frame` has K rows, the arrays are [K]. skipped: as in `Outcome`."""
 
     frame: Frame
     reward: NDArray[Any]

@@ -1,4 +1,4 @@
-"""Who looks after the arm while no episode drives it: a thread that holds, shows, brings home, recovers."""
+"""Attendant of the arm while no episode drives it: a thread that holds, shows, brings home, recovers."""
 
 import contextlib
 import threading
@@ -62,7 +62,7 @@ class Attendant:
         self._wake.set()
 
     def fault(self, error: RobotFault) -> None:
-        """Let the session know; from then on this thread tries to take the arm up again."""
+        """Tell the session of a fault; from then on this thread tries to take the arm up again."""
         with contextlib.suppress(RefusedError):  # stopped already
             self.session.apply(Event.FAULT, str(error))
 

@@ -22,14 +22,14 @@ LOOK_S = 0.05  # how often a waiting thread looks whether it should stop
 
 
 class Display(Protocol):
-    """Where a person sees what goes on."""
+    """Display of an arm's run for its person."""
 
     def show(self, pictures: Mapping[str, NDArray[np.uint8]]) -> None:
         """Pictures [H, W, 3] of the cameras."""
         ...
 
     def health(self, **values: float | str) -> None:
-        """How the robot does."""
+        """Numbers and words on the robot's health."""
         ...
 
     def begin_episode(self, number: int) -> None:
@@ -37,7 +37,7 @@ class Display(Protocol):
         ...
 
     def end_episode(self, number: int, steps: int, seconds: float) -> None:
-        """It is over."""
+        """The episode is over."""
         ...
 
 
@@ -161,7 +161,7 @@ class ArmEnvironment:
         return self._frame
 
     def summary(self) -> str:
-        """How well the rate was kept and how often a limit changed a goal, in one line; "" before anything moved."""
+        """Rate that was kept, and counts of goals that a limit changed, in one line; "" before anything moved."""
         kept = self._pace.statistics()
         if not kept:
             return ""
@@ -172,15 +172,15 @@ class ArmEnvironment:
         )
 
     def _limited(self) -> str:
-        """How often each limit changed a goal; "" where none did."""
+        """Counts of goals that each limit changed; "" where none did."""
         return ", ".join(f"{name} {count}" for name, count in self.arm.guard.interventions.items())
 
     def _label(self) -> Label | None:
-        """What the person said of the present episode, if they have."""
+        """Label that the person gave the present episode; None so far."""
         return self.session.labels.get(self.session.episode)
 
     def _episode(self) -> tuple[int, bool]:
-        """Which episode is on or was last, and whether it has its label."""
+        """Number of the present or last episode, and whether it has its label."""
         number = self.session.episode
         return number, number in self.session.labels
 
@@ -224,7 +224,7 @@ class ArmEnvironment:
             self._wait(lambda: self._label() is not None or self.session.state in IN_MOTION)
 
     def _wait(self, ready: Callable[[], bool]) -> None:
-        """Until something is so. Raises Interrupted after a stop of the person or of the process."""
+        """Wait until something is so. Raises Interrupted after a stop of the person or of the process."""
         began, changed = self._clock.now, self._attendant.changed
         try:
             while True:

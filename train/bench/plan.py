@@ -19,7 +19,7 @@ __all__ = ["Plan", "Run", "load_plan", "runs_of"]
 
 @dataclass(frozen=True)
 class Plan:
-    """What to run: arguments of `cqn-train` by method and by task, seeds, and what all have in common."""
+    """Runs to make: arguments of `cqn-train` by method and by task, seeds, and what all have in common."""
 
     methods: Mapping[str, Sequence[str]]
     tasks: Mapping[str, Sequence[str]]

@@ -28,7 +28,7 @@ RATE = 10  # control steps in a simulated second
 
 
 def run_demo(config: ArmDemoConfig, console: Console) -> dict[str, Any]:
-    """Everything, in order; returns what `summary.json` holds. Raises DemoError when a command fails."""
+    """The demo from recording to picture; returns what `summary.json` holds. Raises DemoError when a command fails."""
     from .figures import arm_session
 
     stages = Stages(config.output_dir, console)

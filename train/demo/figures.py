@@ -57,7 +57,7 @@ def arm_session(episodes: Rows, evaluations: Rows) -> bytes:
 
 
 def dropped_steps(episodes: Sequence[Mapping[str, Any]]) -> bytes:
-    """What the filter dropped: one bar per episode along its time steps, pauses in grey."""
+    """Steps that the filter dropped: one bar per episode along its time steps, pauses in grey."""
     plt = pyplot()
     figure, axes = plt.subplots(figsize=(7.2, 0.11 * len(episodes) + 0.9))
     for row, episode in enumerate(episodes):

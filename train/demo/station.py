@@ -23,7 +23,7 @@ ENV = ("--env.type=ur5e_station", "--env.task=click_button")
 
 
 def run_demo(config: DemoConfig, console: Console) -> dict[str, Any]:
-    """Everything, in order; returns what `summary.json` holds. Raises DemoError when a command fails."""
+    """The demo from recording to report; returns what `summary.json` holds. Raises DemoError when a command fails."""
     from .report import write_report
 
     stages = Stages(config.output_dir, console)

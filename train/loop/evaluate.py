@@ -20,7 +20,7 @@ EVAL_SEED = 2_147_000_000
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What evaluation episodes came to.
+    """Result of evaluation episodes.
 
     outcomes: success; steps: lengths; returns: sums of rewards; frames: pictures of the first episodes.
     """

@@ -84,7 +84,7 @@ class GymEnvironment(_Gym):
         return self._fps
 
     def open(self) -> None:
-        """It is ready."""
+        """Nothing: it is ready."""
 
     def reset(self, seed: int) -> Frame:
         """Start an episode that `seed` determines."""
@@ -155,7 +155,7 @@ def _pictures(observation: Mapping[str, Any]) -> Frame:
 
 
 def _successes(info: Mapping[str, Any], count: int) -> NDArray[Any]:
-    """Which of `count` environments report success, [K] bool."""
+    """Success as `count` environments report it, [K] bool."""
     return np.asarray(info.get("is_success", info.get("succeed", np.zeros(count))), dtype=bool)
 
 

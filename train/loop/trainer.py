@@ -33,7 +33,7 @@ SET_ASIDE = 5  # discarded episodes that may still be labelled otherwise
 
 @dataclass(kw_only=True)
 class Trainer:
-    """Everything the loop touches."""
+    """The loop, with everything it touches."""
 
     config: RunConfig
     agent: Agent

@@ -27,7 +27,7 @@ MAX_TEXT = 500  # characters of a line
 
 @dataclass(frozen=True)
 class _Phase:
-    """What is worked on: units done of `total`, `before` of them when it began."""
+    """Progress of a phase: units done of `total`, `before` of them when it began."""
 
     name: str
     total: float
@@ -38,7 +38,7 @@ class _Phase:
 
 
 class Board:
-    """What the page shows; safe to use from several threads.
+    """Everything that the page shows; safe to use from several threads.
 
     The methods for the training thread copy what they are given and return at once; what they cannot show they leave
     out, without an error. Episodes have the session's numbers everywhere, also in the rows given to `log`.
@@ -111,7 +111,7 @@ class Board:
             _keep_last(self._ended, MAX_EPISODES)
 
     def health(self, **values: float | str) -> None:
-        """What is known of the robot's state, by name; names that are not given stay as they are."""
+        """Note the robot's state by name; names that are not given stay as they are."""
         with self._lock:
             self._health |= {name: _plain(value) for name, value in values.items()}
 
@@ -187,7 +187,7 @@ class Board:
         return None if picture is None else to_jpeg(picture)
 
     def snapshot(self) -> dict[str, Any]:
-        """Everything as plain JSON values, times in seconds; what is not a finite number is None."""
+        """Snapshot as plain JSON values, times in seconds; what is not a finite number is None."""
         session = self.session.snapshot()  # before our own lock: one is never asked for while the other is held
         films, now = self._films.cameras(), self._clock.now
         with self._lock:

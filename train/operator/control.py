@@ -1,4 +1,4 @@
-"""Who of those at the pages is the operator, and whether anybody is there: no web in it."""
+"""Control of the session: which of the pages is the operator's, and whether anybody is there; no web in it."""
 
 import threading
 from collections import Counter
@@ -76,7 +76,7 @@ class Control:
             self._said(f"Control was taken over by the page {client[:4]}.")
 
     def apply(self, client: str | None, event: Event) -> State:
-        """Let a person do something. `stop` is everybody's; the rest is the operator's alone.
+        """Apply what a person asks for. `stop` is everybody's; the rest is the operator's alone.
 
         Raises ViewingOnlyError for others, RefusedError where the event has no place now or is not a person's.
         """
@@ -96,13 +96,13 @@ class Control:
         self._session.relabel(episode, label)
 
     def check(self) -> bool:
-        """Let the session pause where the arm moves and nobody is there; to be called often. True: it did."""
+        """Pause the session where the arm moves and nobody is there; to be called often. True: it did."""
         if self._session.state not in IN_MOTION or self.present():
             return False
         return self.pause("Nobody is at the operator's page: the arm pauses.")
 
     def pause(self, why: str) -> bool:
-        """Let the session pause where the arm moves. True: it did."""
+        """Pause the session where the arm moves. True: it did."""
         try:
             self._session.apply(Event.ABSENT)
         except RefusedError:  # it came to rest meanwhile
@@ -119,7 +119,7 @@ class Control:
             return not (self._gone and now - self._left > min(LEFT_S, self._absent_s))
 
     def snapshot(self, client: str | None) -> dict[str, Any]:
-        """Who is there, as this client may know it: nobody learns the name under which another one acts."""
+        """Presence of others as this client may know it: nobody learns the name under which another one acts."""
         with self._lock:
             return {
                 "you": "operator" if client is not None and client == self._operator else "viewer",

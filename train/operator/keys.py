@@ -83,7 +83,7 @@ class TerminalKeys:
             self._mode = None
 
     def press(self, key: str, now: float = float("inf")) -> None:
-        """What a key does; `now` in seconds tells a key that is held down from one that is pressed again."""
+        """Apply a key; `now` in seconds tells a key that is held down from one that is pressed again."""
         key = key.lower()
         held = key == self._last[0] and now - self._last[1] < _HELD_S
         self._last = (key, now)

@@ -20,7 +20,7 @@ __all__ = ["IN_MOTION", "TRANSITIONS", "Event", "Label", "RefusedError", "Sessio
 
 
 class State(StrEnum):
-    """What is going on."""
+    """States of a session."""
 
     WAITING = "waiting"  # the arm holds, the scene is ready
     RUNNING = "running"  # the policy drives
@@ -33,7 +33,7 @@ class State(StrEnum):
 
 
 class Event(StrEnum):
-    """What can happen: by a person's hand, and by itself."""
+    """Events of a session: by a person's hand, and by themselves."""
 
     START = "start"
     PAUSE = "pause"
@@ -126,7 +126,7 @@ class Session:
     _lock: threading.RLock = field(default_factory=threading.RLock, repr=False)
 
     def apply(self, event: Event, detail: str = "") -> State:
-        """Let an event happen; returns the new state. Raises RefusedError where it has no place.
+        """Apply an event; returns the new state. Raises RefusedError where it has no place.
 
         detail: of a fault, for people.
         """
@@ -212,13 +212,13 @@ class Session:
             return asked
 
     def allowed(self) -> list[Event]:
-        """What a person may do now."""
+        """Events that a person may cause now."""
         with self._lock:
             events = TRANSITIONS[self.state]
             return [event for event in events if event not in BY_ITSELF and not self._obstacle(event)]
 
     def _obstacle(self, event: Event) -> str:
-        """What stands against an event that the state allows, for people; "" where nothing does."""
+        """Reason, for people, against an event that the state allows; "" where there is none."""
         if event is Event.START and self.busy:
             return f"An episode cannot start while the learner is busy ({self.busy}): wait for it."
         if event is Event.TAKE_OVER and self.evaluating:

@@ -1,4 +1,4 @@
-"""What a run's folder says of its policy: the facts of its card, and the files that go to the Hub."""
+"""Facts for the policy's card, and the files that go to the Hub, read from a run's folder."""
 
 import contextlib
 import dataclasses
@@ -259,7 +259,7 @@ def _origin(settings: Mapping[str, Any]) -> str | None:
 
 
 def _schedule(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """What was given of cqn-train's recipe, and not left to the preset."""
+    """Settings of the recipe that were given, and not left to the preset."""
     if "offline_updates" not in settings:
         return {}
     given = {name: settings.get(name) for name in RECIPE}

@@ -25,7 +25,7 @@ SAMPLED = [("start", int), ("length", int), ("terminated", bool), ("demo", bool)
 
 
 class Replay:
-    """Everything seen, with the demonstrations (and relabelled successes) flagged.
+    """The replay: everything seen, with the demonstrations (and relabelled successes) flagged.
 
     Both stores of the paper are views of one: a sample comes from all episodes or from the flagged ones. Of an episode
     that is not flagged, the steps that a person drove count as a demonstration all the same. The demonstrations of the
@@ -301,7 +301,7 @@ class Replay:
             self._places, self._sampled = kept, None
 
     def _index(self, number: int) -> int | None:
-        """Where the run's episode of that number stands among the places."""
+        """Index of the run's episode of that number among the places; None where it is gone."""
         return next((i for i in range(self._fixed, self.episodes) if self._places[i].number == number), None)
 
     def _label_reward(self, place: Place) -> None:
@@ -313,7 +313,7 @@ class Replay:
         self._sampled = None
 
     def _table(self) -> NDArray[Any]:
-        """What is sampled: a row for each episode, and behind them one for each span that a person drove."""
+        """Table that is sampled from: a row for each episode, and behind them one for each span that a person drove."""
         if self._sampled is None:
             rows = [(p.start, p.length, p.terminated, p.demo, 0, p.length) for p in self._places]
             rows += [
@@ -325,7 +325,7 @@ class Replay:
     # -- after a kill ----------------------------------------------------------------------------------------
 
     def _layout(self) -> dict[str, Any]:
-        """What must be the same when a run is resumed: rows of the demonstrations, capacity, shapes."""
+        """Layout that must be the same when a run is resumed: rows of the demonstrations, capacity, shapes."""
         shapes = {name: [*rows.shape, str(rows.dtype)] for name, rows in self._rows.items()}
         return {"ring": self._ring, "capacity": self.capacity, "shapes": shapes}
 

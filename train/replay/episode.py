@@ -32,7 +32,7 @@ class Episode:
         return len(self.action)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """What is stored, T + 1 rows each: a row of its own for the last observation keeps one index for all."""
+        """Arrays to store, T + 1 rows each: a row of its own for the last observation keeps one index for all."""
         state = self.low_dim if self.low_dim is not None else np.zeros((len(self) + 1, 0), np.float32)
         rows = {"low_dim": state.astype(np.float32)}
         for name, values in (("action", self.action), ("reward", self.reward)):

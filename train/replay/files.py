@@ -24,7 +24,7 @@ __all__ = ["Journal", "Place", "Rows"]
 
 @dataclass(frozen=True, kw_only=True)
 class Place:
-    """Where an episode of T steps lies, and what it is.
+    """Place of an episode of T steps in the rows, with what it is.
 
     start: first of its T + 1 rows; number: how many episodes the run had before it; note: what the run wants to know of
     it after a kill (its row of episodes.csv); taught: the steps (first, one past the last) that a person drove.

@@ -29,7 +29,7 @@ def state_names(robot: Robot) -> list[str]:
 
 
 class Arm:
-    """What the session moves: goals [D] in the robot's units, frames under LeRobot's names.
+    """The arm that the session moves: goals [D] in the robot's units, frames under LeRobot's names.
 
     Attributes:
         guard: through which everything goes.
@@ -68,7 +68,7 @@ class Arm:
 
     @property
     def limits(self) -> Limits:
-        """What every goal keeps to."""
+        """Limits that every goal keeps to."""
         return self.guard.limits
 
     def connect(self) -> None:

@@ -149,7 +149,7 @@ class Guard:
         return Reading(joints=joints, pictures=pictures, raw=raw, at=now)
 
     def _check_fresh(self, joints: Array, pictures: Mapping[str, NDArray[np.uint8]], now: float) -> None:
-        """What does not change at all has not been measured: noise alone makes real readings differ."""
+        """Refusal of what does not change at all, and so was not measured: noise alone makes real readings differ."""
         moving = self._goal is not None and (np.abs(self._goal - joints) > 0.5 * self.limits.max_step).any()
         values: dict[str, NDArray[Any]] = {"joints": joints, **pictures}
         for name, value in values.items():

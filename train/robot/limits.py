@@ -16,7 +16,7 @@ Forward = Callable[[Array], Array]
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """What a goal must keep to; each array is [D], one value a joint in the robot's units.
+    """Limits that a goal keeps to; each array is [D], one value a joint in the robot's units.
 
     low, high: joint limits.
     max_step: largest distance of a goal from the measured joint.

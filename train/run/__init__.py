@@ -1,1 +1,1 @@
-"""What a run leaves in its folder and shows on the terminal: checkpoints, metrics, pictures, progress."""
+"""Traces of a run, in its folder and on the terminal: checkpoints, metrics, pictures, progress."""

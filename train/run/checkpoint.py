@@ -29,7 +29,7 @@ __all__ = ["Counters", "last_checkpoint", "restore", "save"]
 
 @dataclass
 class Counters:
-    """How far a run is."""
+    """Progress of a run."""
 
     env_steps: int = 0
     episodes: int = 0

@@ -1,4 +1,4 @@
-"""What a person should see before and while a run learns: the first batch, warnings about the data, films."""
+"""First look at a run for a person: a batch as a picture, warnings about the data, films of evaluations."""
 
 from collections.abc import Sequence
 from dataclasses import asdict

@@ -93,16 +93,16 @@ class Monitors:
         self.monitors = monitors
 
     def phase(self, name: str, total: int, done: int) -> None:
-        """As `ConsoleMonitor.phase`, everywhere."""
+        """A phase begins, in every place."""
         for monitor in self.monitors:
             monitor.phase(name, total, done)
 
     def advance(self, done: int, note: str) -> None:
-        """As `ConsoleMonitor.advance`, everywhere."""
+        """Progress within the phase, in every place."""
         for monitor in self.monitors:
             monitor.advance(done, note)
 
     def message(self, text: str) -> None:
-        """As `ConsoleMonitor.message`, everywhere."""
+        """A line that stays, in every place."""
         for monitor in self.monitors:
             monitor.message(text)

@@ -42,7 +42,7 @@ class SimLeader(Teleoperator):
 
     @property
     def feedback_features(self) -> dict[str, type]:
-        """It can be led to joints, as motorised leaders can."""
+        """Joints that it can be led to, as motorised leaders can."""
         return dict.fromkeys(STATE_NAMES, float)
 
     @property
@@ -52,7 +52,7 @@ class SimLeader(Teleoperator):
 
     @property
     def is_calibrated(self) -> bool:
-        """There is nothing to calibrate."""
+        """Nothing: there is nothing to calibrate."""
         return True
 
     def connect(self, calibrate: bool = True) -> None:
@@ -69,7 +69,7 @@ class SimLeader(Teleoperator):
         """Nothing to do."""
 
     def get_action(self) -> dict[str, Any]:
-        """Where the person holds the leader now. Raises DeviceNotConnectedError, ConfigError without an arm."""
+        """Joints at which the person holds the leader now. Raises DeviceNotConnectedError, ConfigError without an arm."""
         if not self._connected:
             raise DeviceNotConnectedError(f"{self} is not connected: call connect() first.")
         world = self._world or self._meet()

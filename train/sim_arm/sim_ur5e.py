@@ -79,7 +79,7 @@ class SimUR5e(Robot):
 
     @property
     def is_calibrated(self) -> bool:
-        """There is nothing to calibrate."""
+        """Nothing: there is nothing to calibrate."""
         return True
 
     def connect(self, calibrate: bool = True) -> None:
@@ -162,7 +162,7 @@ class SimUR5e(Robot):
         return picture
 
     def tip_position(self, joints: dict[str, float]) -> NDArray[np.float64]:
-        """Where the tip is at joints in degrees, (3,) m, whatever the arm does now."""
+        """Position of the tip at joints in degrees, (3,) m, whatever the arm does now."""
         angles, _ = from_robot_units(joints)
         return self.world.tip_at(angles)
 

@@ -87,7 +87,7 @@ class World:
         return self._painter.submit(self._cameras.picture, self.arm.data, camera, height, width).result()
 
     def tip_at(self, joints: Array) -> Array:
-        """Where the tip would be, (3,) m, with the arm at joints (6,) rad."""
+        """Position of the tip, (3,) m, with the arm at joints (6,) rad."""
         with self.lock:
             return self.arm.tip_at(joints)
 
@@ -127,7 +127,7 @@ class World:
             self._stuck = None if joint is None else (joint, float(self.arm.joints[joint]))
 
     def catch_up(self) -> None:
-        """Let the time since the last look happen."""
+        """Simulate the time since the last look."""
         with self.lock:
             real = self.clock.now
             passed = min(real - self._looked, _BEHIND_S) * self.speed

@@ -1,4 +1,4 @@
-"""What every request passes before it reaches a route: host, origin, token, size; as plain ASGI."""
+"""Checks that every request passes before it reaches a route: host, origin, token, size; as plain ASGI."""
 
 import ipaddress
 import json

@@ -28,7 +28,7 @@ KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
 
 
 class _NonsenseError(ValueError):
-    """What came cannot be understood; the message says what was expected."""
+    """A message that cannot be understood; the error says what was expected."""
 
 
 def need_extra() -> None:
@@ -100,7 +100,7 @@ def _error(status: int, text: str) -> Any:
 
 
 def _add_errors(app: "FastAPI") -> None:
-    """Whatever is refused is answered with one line."""
+    """Answers of one line to all that is refused."""
     from fastapi.exceptions import RequestValidationError
     from starlette.exceptions import HTTPException
 
@@ -125,7 +125,7 @@ def _add_errors(app: "FastAPI") -> None:
 
 
 def _add_actions(app: "FastAPI", board: Board, control: Control, wake: Callable[[], None]) -> None:
-    """What a script needs, too: the state, and everything that a person may do."""
+    """Routes that a script needs, too: the state, and everything that a person may do."""
     from fastapi import Request
     from fastapi.responses import JSONResponse
 
@@ -258,7 +258,7 @@ async def _push(socket: Any, changed: asyncio.Event, state: Callable[[], dict[st
 
 
 def _answer(text: str | None, apply: Callable[[Event], Any]) -> dict[str, Any] | None:
-    """What to say to a message of a page; None to a sign of life."""
+    """Answer to a message of a page; None to a sign of life."""
     number: int | None = None
     try:
         given = _parsed((text or "").encode(errors="replace"))
@@ -281,7 +281,7 @@ def _event(name: str) -> Event:
 
 
 def _client(query: Mapping[str, str], headers: Mapping[str, str]) -> str | None:
-    """Who asks, by `client=` or the header X-Client; None where nobody says so."""
+    """Name of the client, by `client=` or the header X-Client; None where none is given."""
     given = query.get("client", headers.get("x-client"))
     if given is not None and not CLIENT.fullmatch(given):
         raise _NonsenseError("The client's name is 1 to 64 letters, digits, '-' or '_'.")
