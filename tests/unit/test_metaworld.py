@@ -1,7 +1,4 @@
-"""Meta-World's tasks behind our interface: the twenty of the benchmark, each for a few steps, and the rest by size."""
-
-import subprocess
-import sys
+"""Meta-World's tasks behind our interface: objects where they are, experts that succeed, upright pictures."""
 
 import gymnasium as gym
 import numpy as np
@@ -10,16 +7,11 @@ import pytest
 pytest.importorskip("metaworld")
 
 from cqn_train.envs import MetaworldSparseEnv
-from cqn_train.envs.cameras import Cameras
 from cqn_train.envs.metaworld_config import CAMERAS, TASKS, state_size
 from cqn_train.envs.simulator import load_mujoco
-from lerobot_cqn.errors import ConfigError, DataError
+from lerobot_cqn.errors import ConfigError
 
-TWENTY = [
-    "assembly", "button-press", "button-press-topdown", "dial-turn", "door-close", "door-open", "door-unlock",
-    "drawer-open", "faucet-close", "faucet-open", "handle-press", "handle-pull", "peg-unplug-side", "pick-place",
-    "plate-slide", "push", "shelf-place", "sweep", "window-close", "window-open",
-]  # fmt: skip
+from .test_envs import TWENTY
 
 
 @pytest.fixture
@@ -49,33 +41,6 @@ def play(env, operator, seed):
         assert (reward, terminated) == (float(info["is_success"]), info["is_success"])
         over = terminated or truncated
     return len(actions), pauses, info["is_success"], np.stack(actions)
-
-
-def walk(env, seed):
-    """Observations of a reset and three steps, (4, S)."""
-    observations = [env.reset(seed=seed, options={"lerobot_new_rollout": True})[0]]
-    actions = np.array([[1, 0, -1, 1], [0, 1, 0, -1], [0.3, -0.2, -0.5, 0]], np.float32)
-    observations.extend(env.step(action)[0] for action in actions)
-    for observation in observations:
-        assert env.observation_space.contains(observation)
-    return np.stack([np.append(o["agent_pos"], o["environment_state"]) for o in observations])
-
-
-@pytest.mark.parametrize("task", TWENTY)
-def test_an_episode_is_a_function_of_its_seed(make, task):
-    env = make(task)
-    first = walk(env, 3)
-    assert first.shape == (4, 4 + state_size(task))
-    assert len(env.unwrapped.environment_state_names) == state_size(task)
-    assert env.reset(seed=4)[1] == {"is_success": False}
-    env.action_space.seed(0)
-    for _ in range(5):
-        _, reward, terminated, _, info = env.step(env.action_space.sample())
-        assert (reward, terminated) == (float(info["is_success"]), info["is_success"])
-    np.testing.assert_array_equal(walk(env, 3), first)
-    # Without a seed the stream goes on, and the scene is another one.
-    again = env.reset()[0]["environment_state"]
-    assert np.abs(again - first[0, 4:]).max() > 1e-3
 
 
 @pytest.mark.parametrize("task", TWENTY)
@@ -179,22 +144,6 @@ def test_actions_move_the_hand_and_are_clipped(make):
     assert 0.06 < observation["agent_pos"][0] - x < 0.125
 
 
-@pytest.mark.parametrize(
-    ("action", "message"),
-    [
-        (np.zeros(3), r"shape \(3,\): expected \(4,\), hand_x"),
-        (np.zeros((1, 4)), r"shape \(1, 4\)"),
-        (np.array([0, np.nan, 0, 0]), "not finite at 'hand_y'"),
-    ],
-)
-def test_wrong_actions_are_refused_in_one_line(make, action, message):
-    env = make()
-    env.reset(seed=0)
-    with pytest.raises(DataError, match=message) as error:
-        env.unwrapped.step(action)
-    assert "\n" not in str(error.value)
-
-
 def test_the_time_limit_truncates_and_may_be_longer_than_meta_worlds_own(make):
     env = make(max_episode_steps=130)
     env.reset(seed=0)
@@ -223,35 +172,6 @@ def test_cameras_show_different_upright_pictures(make):
     assert frame.mean() > 40
 
 
-def test_state_mode_opens_no_graphics(make, monkeypatch):
-    def refuse(*_):
-        raise AssertionError
-
-    monkeypatch.setattr(Cameras, "picture", refuse)
-    env = make()
-    env.reset(seed=0)
-    env.step(np.zeros(4, np.float32))
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"task": "drawer-opn"}, "Did you mean 'drawer-open'"),
-        ({"task": None}, "Unknown Meta-World task ''"),
-        ({"obs_type": "pixel"}, "Did you mean 'pixels'"),
-        ({"cameras": ["corner4"]}, "Unknown camera"),
-        ({"cameras": [], "obs_type": "both"}, "at least one"),
-        ({"image_size": 8}, "16 to 1024"),
-        ({"fps": 30}, "10, 20, 40 or 80"),
-        ({"episode_length": 0}, "at least 1"),
-    ],
-)
-def test_wrong_settings_are_refused_in_one_line(settings, message):
-    with pytest.raises(ConfigError, match=message) as error:
-        MetaworldSparseEnv(**settings)
-    assert "\n" not in str(error.value)
-
-
 def test_a_task_may_leave_out_its_version_and_the_horizon_goes_with_the_rate():
     short, full = MetaworldSparseEnv(task="drawer-open"), MetaworldSparseEnv(task="drawer-open-v3")
     assert short == full
@@ -260,27 +180,3 @@ def test_a_task_may_leave_out_its_version_and_the_horizon_goes_with_the_rate():
     assert MetaworldSparseEnv(fps=80).max_episode_steps == 400
     assert MetaworldSparseEnv(episode_length=7).max_episode_steps == 7
     assert [tuple(f.shape) for f in MetaworldSparseEnv(task="hammer").features.values()] == [(4,), (4,), (17,)]
-
-
-def test_a_fresh_process_imports_no_simulator_explains_its_absence_and_leaves_quietly():
-    code = """
-import sys
-import cqn_train.envs
-import gymnasium
-
-name = cqn_train.envs.MetaworldSparseEnv().gym_id
-assert not {"mujoco", "metaworld"} & set(sys.modules)
-sys.modules["metaworld"] = None
-try:
-    gymnasium.make(name)
-except Exception as error:
-    print(type(error).__name__, error)
-del sys.modules["metaworld"]
-env = gymnasium.make(name, obs_type="pixels", cameras=["corner2"], image_size=32)
-env.reset(seed=0)  # and no close
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stderr == ""
-    assert done.stdout.count("\n") == 1
-    assert done.stdout.startswith("ConfigError")
-    assert "pip install 'lerobot_policy_cqn[metaworld]'" in done.stdout

@@ -208,22 +208,6 @@ def test_the_papers_tasks_and_limits():
     assert RLBenchEnv(episode_length=7).gym_kwargs["max_episode_steps"] == 7
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"task": "open_draw"}, "Did you mean 'open_drawer'"),
-        ({"obs_type": "state"}, "expected 'pixels'"),
-        ({"cameras": ["overhead"]}, "Unknown camera 'overhead'"),
-        ({"fps": 10}, "fps is 10: expected 20"),
-        ({"variation": -1}, "variation is -1"),
-    ],
-)
-def test_wrong_settings_are_one_line(given, message):
-    with pytest.raises(ConfigError, match=message) as raised:
-        RLBenchEnv(**given)
-    assert "\n" not in str(raised.value)
-
-
 def test_a_variation_the_task_does_not_have(fake_rlbench):
     with pytest.raises(ConfigError, match="variation is 3: expected 0 to 2"):
         RLBenchGym(variation=3)
