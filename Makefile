@@ -2,6 +2,7 @@
 SHELL := /bin/bash
 RUN := ./.ci/setup.sh
 WORKERS ?= 2# test processes at a time; one thread each
+SPREAD := --dist loadfile --no-loadscope-reorder# the long files first, by their folders' names
 SEED := $(or $(SEED),$(shell echo $$RANDOM))# of the property tests in `make slow`
 ARGS ?=# handed on to the target's command, e.g. make test ARGS='-k losses'
 
@@ -21,12 +22,12 @@ demo-arm: ## the same on a simulated arm: lerobot-record, the operator's page, a
 	@$(RUN) .venv/bin/python -m cqn_train.demo.arm --output_dir=outputs/demo-arm $(ARGS)
 
 test: ## the fast tests
-	@$(RUN) .venv/bin/python -m pytest -n $(WORKERS) --dist loadfile --durations=10 $(ARGS)
+	@$(RUN) .venv/bin/python -m pytest -n $(WORKERS) $(SPREAD) --durations=10 $(ARGS)
 
 slow: ## the tests that train for minutes, and the property tests with examples drawn anew; SEED=... draws them again
 	@echo "Property tests: make slow SEED=$(SEED)"
 	@CQN_EXAMPLES=random $(RUN) .venv/bin/python -m pytest -m 'slow or hypothesis' --hypothesis-seed=$(SEED) \
-	  -n $(WORKERS) --dist loadfile --timeout 3600 $(ARGS)
+	  -n $(WORKERS) $(SPREAD) --timeout 3600 $(ARGS)
 
 check: ## lint, formatting, types, import rules
 	@$(RUN) .venv/bin/python -m ruff check .

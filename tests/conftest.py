@@ -5,7 +5,9 @@ All are environment variables, set before torch, LeRobot or MuJoCo is imported: 
 
 import ctypes
 import functools
+import operator
 import os
+import random
 import shutil
 import signal
 import sys
@@ -51,6 +53,15 @@ def _has_library(name: str) -> bool:
 if sys.platform == "linux" and not os.environ.get("DISPLAY") and not os.environ.get("MUJOCO_GL"):
     only_software = _has_library("libOSMesa.so.8") and not _has_library("libEGL.so.1")
     os.environ["MUJOCO_GL"] = "osmesa" if only_software else "egl"
+
+
+@pytest.fixture(autouse=True)
+def _same_chance() -> None:
+    """A test that draws without a generator of its own draws the same numbers, whichever test ran before it."""
+    random.seed(0)
+    for name, seed in (("numpy", "random.seed"), ("torch", "manual_seed")):
+        if name in sys.modules:
+            operator.attrgetter(seed)(sys.modules[name])(0)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -116,7 +116,7 @@ class Person(Protocol):
         """Say what the learner is at; no episode can start until the environment is asked for one."""
         ...
 
-    def take_relabelled(self) -> Mapping[int, Label]:
+    def take_corrected(self) -> Mapping[int, Label]:
         """Labels of finished episodes, by number, that were changed since the last call."""
         ...
 
@@ -146,7 +146,7 @@ class Nobody:
     def learning(self, doing: str) -> None:
         """Nothing: there is nobody to tell."""
 
-    def take_relabelled(self) -> dict[int, Label]:
+    def take_corrected(self) -> dict[int, Label]:
         """Nothing."""
         return {}
 

@@ -1,7 +1,9 @@
-"""What the tests of the commands share: datasets, made once a process, and a way to run a command."""
+"""What the tests of the commands share: datasets, made once for all workers, and a way to run a command."""
 
+import fcntl
 import logging
 import os
+import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +15,7 @@ from cqn_train.cli import main as cqn_train
 
 from ..toy_datasets import make_dataset
 from .data_recording import make_recording
+from .terminal import record_demonstrations
 from .zygote import Zygote, zygote
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
@@ -29,6 +32,7 @@ TINY_RUN = [
 ]  # fmt: skip
 
 
+ARM_CAMERA = ["--robot.camera_names=[upper_wrist]", "--robot.image_height=96", "--robot.image_width=128"]
 # What every command imports, of ours nothing: that LeRobot finds the policy by itself is part of what is tested.
 PRELOAD = (
     "torch._dynamo, lerobot.scripts.lerobot_train, lerobot.scripts.lerobot_edit_dataset, mujoco, matplotlib.pyplot"
@@ -57,48 +61,79 @@ def command(processes: Zygote, tmp_path_factory: pytest.TempPathFactory) -> Comm
     return run
 
 
+def once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder in which `make` has put what tests only read, once for all workers of a run."""
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared" / name
+    folder.parent.mkdir(exist_ok=True)
+    with folder.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            folder.mkdir()
+            try:
+                make(folder)
+            except BaseException:
+                shutil.rmtree(folder)
+                raise
+    return folder
+
+
 @pytest.fixture(scope="session")
 def click(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """Arguments that name three scripted demonstrations in the station, without rewards."""
     pytest.importorskip("mujoco")
-    root = tmp_path_factory.mktemp("click") / "click"
-    record = ["record", "--env.type=ur5e_station", "--repo_id=local/click", f"--root={root}", "--episodes=3"]
-    environment = dict(os.environ)
-    try:
-        assert cqn_data([*record, "--pause_share=0"]) == 0
-    finally:  # the command silences its own process for good; this one goes on
-        logging.disable(logging.NOTSET)
-        os.environ.clear()
-        os.environ.update(environment)
-    return ["--dataset.repo_id=local/click", f"--dataset.root={root}"]
+
+    def record(folder: Path) -> None:
+        options = ["record", "--env.type=ur5e_station", "--repo_id=local/click", f"--root={folder / 'click'}"]
+        environment = dict(os.environ)
+        try:
+            assert cqn_data([*options, "--episodes=3", "--pause_share=0"]) == 0
+        finally:  # the command silences its own process for good; this one goes on
+            logging.disable(logging.NOTSET)
+            os.environ.clear()
+            os.environ.update(environment)
+
+    return ["--dataset.repo_id=local/click", f"--dataset.root={once(tmp_path_factory, 'click', record) / 'click'}"]
 
 
 @pytest.fixture(scope="session")
 def rewarded(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """Arguments that name a dataset with rewards, one of its episodes a failure."""
-    root = make_dataset(tmp_path_factory.mktemp("rewarded") / "data", reward=True, failed=(1,))
-    return ["--dataset.repo_id=local/toy", f"--dataset.root={root}"]
+    made = once(tmp_path_factory, "rewarded", lambda at: make_dataset(at / "data", reward=True, failed=(1,)))
+    return ["--dataset.repo_id=local/toy", f"--dataset.root={made / 'data'}"]
 
 
 @pytest.fixture(scope="session")
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """Arguments that name a dataset with a camera, state and rewards."""
-    root = make_dataset(tmp_path_factory.mktemp("filmed") / "data", camera=True, reward=True)
-    return ["--dataset.repo_id=local/toy", f"--dataset.root={root}"]
+    made = once(tmp_path_factory, "filmed", lambda at: make_dataset(at / "data", camera=True, reward=True))
+    return ["--dataset.repo_id=local/toy", f"--dataset.root={made / 'data'}"]
 
 
 @pytest.fixture(scope="session")
 def straight(click: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a short cqn-train run that nothing interrupted."""
-    folder = tmp_path_factory.mktemp("straight") / "run"
-    assert cqn_train([*TINY_RUN, *click, f"--output_dir={folder}"]) == 0
-    return folder
+
+    def train(folder: Path) -> None:
+        assert cqn_train([*TINY_RUN, *click, f"--output_dir={folder / 'run'}"]) == 0
+
+    return once(tmp_path_factory, "straight", train) / "run"
 
 
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a small recording with a camera; see `data_recording`."""
-    return make_recording(tmp_path_factory.mktemp("recording") / "src")
+    return once(tmp_path_factory, "recording", lambda at: make_recording(at / "src")) / "src"
+
+
+@pytest.fixture(scope="session")
+def recorded_arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of three demonstrations that lerobot-record took of the simulated arm and leader, with ARM_CAMERA."""
+
+    def record(folder: Path) -> None:
+        record_demonstrations(folder, *ARM_CAMERA, "--robot.state=true", episodes=3)
+
+    return once(tmp_path_factory, "recorded_arm", record) / "demos"
 
 
 @pytest.fixture(autouse=True)

@@ -14,12 +14,10 @@ import pytest
 from cqn_train.cli import main
 from cqn_train.replay.files import Journal
 
-from .conftest import TINY_POLICY, Command
-from .terminal import record_demonstrations
+from .conftest import ARM_CAMERA, TINY_POLICY, Command
 from .zygote import Zygote, wait_until
 
 pytest.importorskip("mujoco")
-CAMERA = ["--robot.camera_names=[upper_wrist]", "--robot.image_height=96", "--robot.image_width=128"]
 BLIND = ["--robot.camera_names=[]"]
 STATE_ONLY = ['--policy.input_features={"observation.state": {"type": "STATE", "shape": [10]}}']
 SMALL_EYES = ["--policy.encoder_channels=[4,8]", "--policy.shift_pixels=2"]
@@ -27,19 +25,18 @@ JOINTS = slice(0, 6)
 
 
 @pytest.fixture(scope="module")
-def demonstrations(command: Command, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of two demonstrations after the paper's recipe: joint differences, pictures of 84x84."""
+def demonstrations(recorded_arm: Path, command: Command, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of demonstrations after the paper's recipe: joint differences, pictures of 84x84."""
     folder = tmp_path_factory.mktemp("rollout")
-    recorded = record_demonstrations(folder, *CAMERA, "--robot.state=true", episodes=2)
     command(
-        "cqn-data", "run", "paper_real_world", "--repo_id=local/demos", f"--root={recorded}",
+        "cqn-data", "run", "paper_real_world", "--repo_id=local/demos", f"--root={recorded_arm}",
         "--new_repo_id=local/cqn", f"--new_root={folder / 'cqn'}",
     )  # fmt: skip
     return folder / "cqn"
 
 
 @pytest.mark.real_time(reason="lerobot-rollout drives the simulated arm for three seconds of the machine's own clock")
-@pytest.mark.parametrize(("trained", "robot"), [(STATE_ONLY, BLIND), (SMALL_EYES, CAMERA)], ids=["state", "camera"])
+@pytest.mark.parametrize(("trained", "robot"), [(STATE_ONLY, BLIND), (SMALL_EYES, ARM_CAMERA)], ids=["state", "camera"])
 def test_rollout_sends_absolute_goals(
     trained: list[str], robot: list[str], demonstrations: Path, command: Command, tmp_path: Path
 ) -> None:
@@ -95,7 +92,7 @@ def test_online_with_a_person_killed_and_resumed(
     monkeypatch.setenv("CQN_PAGE_TOKEN", "a-token-of-the-test")
     run, log = tmp_path / "run", tmp_path / "log.txt"
     arguments = [
-        *TINY_POLICY, *SMALL_EYES, *CAMERA, "--robot.type=sim_ur5e", "--robot.state=true", "--robot.speed=4",
+        *TINY_POLICY, *SMALL_EYES, *ARM_CAMERA, "--robot.type=sim_ur5e", "--robot.state=true", "--robot.speed=4",
         f"--robot.person=http://127.0.0.1:{port}", "--robot.person_takes_over_s=2", "--teleop.type=sim_leader",
         "--dataset.repo_id=local/cqn", f"--dataset.root={demonstrations}", f"--page.port={port}", "--operator_page",
         "--offline_updates=2", "--updates_per_episode=2", "--batch_size=4", "--demo_batch_size=4", "--steps=100000",
@@ -130,10 +127,11 @@ def test_online_with_a_person_killed_and_resumed(
     (["--robot.type=sim_ur5"], "sim_ur5e"),
     (["--robot.type=sim_ur5e", "--robot.state=true", "--robot.camera_names=[left_shoulder]"], "Unknown camera of"),
     (["--robot.type=sim_ur5e", "--robot.camera_names=[upper_wrist]"], "state has 10 values, the robot's 7"),
-    (["--robot.type=sim_ur5e", *CAMERA, "--robot.state=true", "--arm.joint_limits={elbo.pos: [0, 1]}"], "elbow.pos"),
-    (["--robot.type=sim_ur5e", *CAMERA, "--robot.state=true", "--arm.workspace=[1, 0, 0, 1, 0, 1]"], "low < high"),
+    (["--robot.type=sim_ur5e", *ARM_CAMERA, "--robot.state=true", "--arm.joint_limits={elbo.pos: [0, 1]}"],
+     "elbow.pos"),
+    (["--robot.type=sim_ur5e", *ARM_CAMERA, "--robot.state=true", "--arm.workspace=[1, 0, 0, 1, 0, 1]"], "low < high"),
     (["--teleop.type=sim_leader", "--env.type=ur5e_station"], "leader of an arm"),
-    (["--robot.type=sim_ur5e", *CAMERA, "--robot.state=true", "--operator_page=false"], "There is no terminal"),
+    (["--robot.type=sim_ur5e", *ARM_CAMERA, "--robot.state=true", "--operator_page=false"], "There is no terminal"),
 ])  # fmt: skip
 def test_mistakes_are_said_before_anything_moves(
     options: list[str], said: str, demonstrations: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -153,7 +151,7 @@ def test_a_port_in_use_is_said_before_anything_is_written(
         taken.listen()
         port = taken.getsockname()[1]
         options = [
-            *TINY_POLICY, *SMALL_EYES, *CAMERA, "--dataset.repo_id=local/cqn", f"--dataset.root={demonstrations}",
+            *TINY_POLICY, *SMALL_EYES, *ARM_CAMERA, "--dataset.repo_id=local/cqn", f"--dataset.root={demonstrations}",
             "--robot.type=sim_ur5e", "--robot.state=true", f"--page.port={port}",
             f"--output_dir={tmp_path / 'run'}",
         ]  # fmt: skip

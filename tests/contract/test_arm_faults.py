@@ -107,7 +107,7 @@ def test_faults_while_the_arm_is_driven(kind: str, moment: str) -> None:
                 marks["breaks"] = arm.session.breaks
                 sent = len(arm.goals)
                 with pytest.raises(Exception, match="label"):
-                    arm.session.relabel(0, Label.SUCCESS)
+                    arm.session.correct(0, Label.SUCCESS)
                 arm.soon(arm.is_state(State.LABELLING))
                 marks["holds"] = len(arm.goals) - sent
             else:

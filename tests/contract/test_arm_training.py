@@ -165,8 +165,8 @@ def test_labels_and_second_thoughts(demonstrations: list[str], tmp_path: Path) -
     def prepare(trainer: Trainer, hands: Hands) -> None:
         session = hands.session
         hands.during[4] = lambda: (
-            session.relabel(0, Label.FAILURE), session.relabel(1, Label.SUCCESS), session.relabel(2, Label.SUCCESS),
-            session.relabel(3, Label.DISCARD),
+            session.correct(0, Label.FAILURE), session.correct(1, Label.SUCCESS), session.correct(2, Label.SUCCESS),
+            session.correct(3, Label.DISCARD),
         )  # fmt: skip
 
     trainer, stopped = run([*ARM, *demonstrations, f"--output_dir={tmp_path / 'run'}"], [S, F, D, S, F], prepare)
@@ -258,7 +258,7 @@ def test_a_killed_run_keeps_episodes_and_second_thoughts_in_order(demonstrations
     def die(trainer: Trainer, hands: Hands) -> None:
         saved = trainer.save
         trainer.save = lambda: saved() if not trainer.counters.episodes else None
-        hands.during[3] = lambda: hands.session.relabel(1, Label.SUCCESS)
+        hands.during[3] = lambda: hands.session.correct(1, Label.SUCCESS)
 
     first, _ = run([*ARM, *demonstrations, folder], [S, D, F, F], die)
     assert [place.number for place in first.replay._places[3:]] == [0, 2, 3, 1]
@@ -277,7 +277,7 @@ def test_a_second_thought_right_before_the_stop_counts(demonstrations: list[str]
 
     def prepare(trainer: Trainer, hands: Hands) -> None:
         hands.during[2] = lambda: (
-            hands.session.relabel(0, Label.FAILURE), hands.session.relabel(1, Label.SUCCESS),
+            hands.session.correct(0, Label.FAILURE), hands.session.correct(1, Label.SUCCESS),
             hands.session.apply(Event.STOP),
         )  # fmt: skip
 

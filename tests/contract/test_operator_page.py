@@ -167,10 +167,10 @@ def test_a_session_over_http(client: TestClient, board: Board) -> None:
     ]:  # fmt: skip
         answer = client.post("/api/event", headers=ANN, json={"event": event})
         assert answer.json() == {"ok": True, "state": state}
-    answer = client.post("/api/relabel", headers=ANN, json={"episode": 0, "label": "success"})
+    answer = client.post("/api/correct", headers=ANN, json={"episode": 0, "label": "success"})
     assert answer.json() == {"ok": True}
-    assert board.session.take_relabelled() == {0: "success"}
-    answer = client.post("/api/relabel", headers=ANN, json={"episode": 5, "label": "success"})
+    assert board.session.take_corrected() == {0: "success"}
+    answer = client.post("/api/correct", headers=ANN, json={"episode": 5, "label": "success"})
     assert (answer.status_code, answer.json()["error"]) == (
         409, "Episode 5 has no label to change: finished episodes are 0 to 0.",
     )  # fmt: skip
@@ -197,8 +197,8 @@ def test_nonsense_is_refused_in_one_line(client: TestClient, board: Board, body:
     {"episode": 0, "label": "good"}, {"episode": 0}, {"episode": 0.0, "label": "success"}])  # fmt: skip
 def test_nonsense_labels(client: TestClient, board: Board, body: dict) -> None:
     film(board)
-    assert client.post("/api/relabel", headers=ANN, json=body).status_code == 422
-    assert board.session.take_relabelled() == {}
+    assert client.post("/api/correct", headers=ANN, json=body).status_code == 422
+    assert board.session.take_corrected() == {}
 
 
 # --- Operator and viewers.

@@ -41,11 +41,11 @@ bodies = st.one_of(
     st.binary(max_size=20), st.one_of(values, events, labels).map(lambda value: json.dumps(value).encode())
 )
 pieces = st.sampled_from(
-    ["api", "state", "event", "relabel", "control", "camera", "film", "front", "front.jpg", "0", "-1", "9" * 30, "..",
+    ["api", "state", "event", "correct", "control", "camera", "film", "front", "front.jpg", "0", "-1", "9" * 30, "..",
      "%2e%2e", "%00", "ws", "page.js", "a b", "ä", "", "{name}"]
 )  # fmt: skip
 routes = st.one_of(
-    st.sampled_from(["/api/state", "/api/event", "/api/relabel", "/api/control", "/api/film/0/front", "/"]),
+    st.sampled_from(["/api/state", "/api/event", "/api/correct", "/api/control", "/api/film/0/front", "/"]),
     st.lists(pieces, max_size=4).map(lambda parts: "/" + "/".join(parts)),
 )
 queries = st.dictionaries(

@@ -17,7 +17,6 @@ from cqn_train.sim_arm.world import WORLDS
 from lerobot_cqn.errors import ConfigError
 
 from ..driven_clock import DrivenClock
-from .terminal import record_demonstrations
 
 pytest.importorskip("mujoco")
 PAN = np.array([1.0, 0, 0, 0, 0, 0])
@@ -157,10 +156,9 @@ def test_wrong_settings(settings: dict[str, object], said: str) -> None:
 
 
 @pytest.mark.real_time(reason="lerobot-record keeps its rate by the machine's own clock")
-def test_lerobot_record_mirrors_the_leader(tmp_path: Path) -> None:
+def test_lerobot_record_mirrors_the_leader(recorded_arm: Path) -> None:
     """As a person at the terminal: ends the episode when the task is done, and the reset when the arm is home."""
-    root = record_demonstrations(tmp_path, "--robot.camera_names=[upper_wrist]", "--robot.state=true", episodes=3)
-    rows = pd.concat([pd.read_parquet(file) for file in sorted(root.glob("data/**/*.parquet"))])
+    rows = pd.concat([pd.read_parquet(file) for file in sorted(recorded_arm.glob("data/**/*.parquet"))])
     lengths = rows.groupby("episode_index").size()
     assert len(lengths) == 3
     assert (lengths > 15).all()

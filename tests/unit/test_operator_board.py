@@ -281,7 +281,7 @@ def test_the_first_is_the_operator_and_others_only_stop(control: Control) -> Non
     with pytest.raises(ViewingOnlyError):
         control.apply(None, Event.PAUSE)
     with pytest.raises(ViewingOnlyError):
-        control.relabel("bob", 0, Label.FAILURE)
+        control.correct("bob", 0, Label.FAILURE)
     assert session.state is State.RUNNING
     control.take("bob")
     assert control.snapshot("bob")["you"] == "operator"

@@ -121,19 +121,19 @@ def test_between_episodes_a_fault_asks_for_no_label() -> None:
     assert made.apply(Event.RECOVERED) is State.RESETTING
 
 
-def test_relabelling() -> None:
+def test_correcting_a_label() -> None:
     made = session(State.RESETTING)
     with pytest.raises(RefusedError, match="finished episodes are 0 to 0"):
-        made.relabel(3, Label.FAILURE)
-    made.relabel(0, Label.SUCCESS)  # as it is
-    assert made.take_relabelled() == {}
-    made.relabel(0, Label.FAILURE)
-    made.relabel(0, Label.DISCARD)
-    assert made.take_relabelled() == {0: Label.DISCARD}
-    assert made.take_relabelled() == {}
+        made.correct(3, Label.FAILURE)
+    made.correct(0, Label.SUCCESS)  # as it is
+    assert made.take_corrected() == {}
+    made.correct(0, Label.FAILURE)
+    made.correct(0, Label.DISCARD)
+    assert made.take_corrected() == {0: Label.DISCARD}
+    assert made.take_corrected() == {}
     assert made.snapshot()["labels"] == {"0": "discard"}
     with pytest.raises(RefusedError, match="none yet"):
-        Session().relabel(0, Label.SUCCESS)
+        Session().correct(0, Label.SUCCESS)
 
 
 def test_a_person_is_offered_what_is_possible() -> None:
@@ -184,7 +184,7 @@ def test_an_evaluation_is_the_policys_alone_and_not_learned_from() -> None:
     made.learning("")
     made.expect(7)
     with pytest.raises(RefusedError, match="Evaluations are not learned from"):
-        made.relabel(-1, Label.FAILURE)
+        made.correct(-1, Label.FAILURE)
     made.apply(Event.READY)
     made.apply(Event.START)
     assert made.episode == 7

@@ -284,7 +284,7 @@ def test_steps_of_a_person_are_demonstrations_whatever_became_of_the_episode(
 
 @settings(max_examples=30, deadline=None)
 @given(taught_episodes, st.data())
-def test_relabelling_and_forgetting_leave_what_a_person_drove(
+def test_correcting_and_forgetting_leave_what_a_person_drove(
     made: list[tuple[list[bool], bool, bool]], data: st.DataObject
 ) -> None:
     replay, held = Replay(1, 2, GAMMA), dict[int, tuple[list[bool], bool]]()
@@ -299,7 +299,7 @@ def test_relabelling_and_forgetting_leave_what_a_person_drove(
             assert replay.forget(number) == there
             held.pop(number, None)
         else:
-            assert replay.relabel(number, success=change == "success", demo=change == "success") == there
+            assert replay.correct(number, success=change == "success", demo=change == "success") == there
             if there:
                 held[number] = held[number][0], change == "success"
     if held:
@@ -321,9 +321,9 @@ def test_taught_steps_are_found_again_by_a_later_process(tmp_path: Path) -> None
     flags = {0: [True, False, True, True], 1: [False, True], 2: [True, True, False], 3: [True]}
     for number, driven in flags.items():
         add_taught(first, number, driven)
-    first.relabel(1, success=True, demo=True)
-    first.relabel(2, success=True, demo=True)
-    first.relabel(2, success=False, demo=False)
+    first.correct(1, success=True, demo=True)
+    first.correct(2, success=True, demo=True)
+    first.correct(2, success=False, demo=False)
     first.forget(3)
     second = Replay(1, 1, GAMMA, folder=tmp_path)
     assert [place.taught for place in second.reopen()] == [spans_of(flags[n]) for n in range(3)]

@@ -217,12 +217,12 @@ def at_the_end(replay: Replay, episode: int, length: int) -> set[tuple[float, fl
 
 
 @pytest.mark.parametrize("reopened", [False, True])
-def test_an_episode_that_is_relabelled_earns_its_reward_and_ends(tmp_path: Path, reopened: bool) -> None:
+def test_an_episode_that_is_corrected_earns_its_reward_and_ends(tmp_path: Path, reopened: bool) -> None:
     replay = run_of(tmp_path)
     assert replay.demonstrations == 1
-    assert replay.relabel(2, success=True, demo=True)
-    assert replay.relabel(1, success=True, demo=True)
-    assert replay.relabel(1, success=False, demo=False)  # a second thought
+    assert replay.correct(2, success=True, demo=True)
+    assert replay.correct(1, success=True, demo=True)
+    assert replay.correct(1, success=False, demo=False)  # a second thought
     if reopened:
         replay = small(tmp_path, 10_000)
         assert [(p.number, p.success, p.terminated) for p in replay.reopen()] == [
@@ -241,8 +241,8 @@ def test_an_episode_that_is_forgotten_is_not_sampled_again(tmp_path: Path, reope
     replay = run_of(tmp_path)
     assert replay.forget(1)
     assert not replay.forget(1)
-    assert not replay.relabel(1, success=True, demo=True)
-    assert replay.relabel(3, success=True, demo=True)  # right after it in the journal
+    assert not replay.correct(1, success=True, demo=True)
+    assert replay.correct(3, success=True, demo=True)  # right after it in the journal
     if reopened:
         replay = small(tmp_path, 10_000)
         replay.reopen()
@@ -251,9 +251,9 @@ def test_an_episode_that_is_forgotten_is_not_sampled_again(tmp_path: Path, reope
     assert stored(replay) == {0, 1, 3, 4, 9}
 
 
-def test_what_has_made_room_cannot_be_relabelled() -> None:
+def test_what_has_made_room_cannot_be_corrected() -> None:
     replay = small(None, 14)
     for number in range(4):
         replay.add(make_episode(number + 1, 3, views=1), demo=False, number=number)
-    assert not replay.relabel(0, success=True, demo=True)
-    assert replay.relabel(3, success=True, demo=True)
+    assert not replay.correct(0, success=True, demo=True)
+    assert replay.correct(3, success=True, demo=True)

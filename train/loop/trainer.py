@@ -68,7 +68,7 @@ class Trainer:
             self._online()
             self.evaluate("final", self.config.final_episodes)
         finally:
-            self._relabel()  # what was said since the last episode, before a stop
+            self._correct()  # what was said since the last episode, before a stop
         self.save()
 
     def _offline(self) -> None:
@@ -91,7 +91,7 @@ class Trainer:
             except Interrupted:  # the unfinished episode is dropped, so its steps do not count either
                 c.env_steps = before if c.episodes == number else c.env_steps
                 raise
-            self._relabel()
+            self._correct()
             self.updates(self.config.recipe.updates_per_episode, on_update=self._tell_updates)
             c.online_s += self.clock.now - began - (self.env.waited_s - waited)
             self._look_and_save(before)
@@ -165,9 +165,9 @@ class Trainer:
         lately = f"success {sum(self._recent)}/{len(self._recent)} lately"
         self.monitor.advance(c.env_steps, f"episode {c.episodes}  {lately}  Q {mean_q:+.2f}")
 
-    def _relabel(self) -> None:
+    def _correct(self) -> None:
         """Learn from now on what a person says otherwise about finished episodes."""
-        for number, label in self.person.take_relabelled().items():
+        for number, label in self.person.take_corrected().items():
             success = label is Label.SUCCESS
             demo = self.config.recipe.relabel and success
             if label is Label.DISCARD:
@@ -177,7 +177,7 @@ class Trainer:
                     episode, row = self._aside.pop(number)
                     self.replay.add(replace(episode, terminated=True), demo=demo, number=number, note=row)
                     self.metrics.write("episodes", row | {"success": int(success)})
-                there = self.replay.relabel(number, success=success, demo=demo)
+                there = self.replay.correct(number, success=success, demo=demo)
             gone = "" if there else " It is not in the replay any more: nothing changes."
             self.monitor.message(f"Episode {number} is a {label} now.{gone}")
 

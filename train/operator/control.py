@@ -88,12 +88,12 @@ class Control:
             self._only_operator(client)
         return self._session.apply(event)
 
-    def relabel(self, client: str | None, episode: int, label: Label) -> None:
+    def correct(self, client: str | None, episode: int, label: Label) -> None:
         """Say otherwise how an episode went. Raises ViewingOnlyError, or RefusedError for an unfinished one."""
         if client is not None:
             self.seen(client)
         self._only_operator(client)
-        self._session.relabel(episode, label)
+        self._session.correct(episode, label)
 
     def check(self) -> bool:
         """Pause the session where the arm moves and nobody is there; to be called often. True: it did."""

@@ -122,7 +122,7 @@ class Session:
     _home: bool = False
     _drove: bool = False
     _unlabelled: bool = False
-    _relabelled: dict[int, Label] = field(default_factory=dict)
+    _corrected: dict[int, Label] = field(default_factory=dict)
     _lock: threading.RLock = field(default_factory=threading.RLock, repr=False)
 
     def apply(self, event: Event, detail: str = "") -> State:
@@ -159,23 +159,25 @@ class Session:
             self.on_change(self)
             return after
 
-    def relabel(self, episode: int, label: Label) -> None:
+    def correct(self, episode: int, label: Label) -> None:
         """Say otherwise how a finished episode went. Raises RefusedError for one that has no label yet."""
         with self._lock:
             if episode < 0:
-                raise RefusedError("Evaluations are not learned from: only episodes of the run can be relabelled.")
+                raise RefusedError(
+                    "Evaluations are not learned from: only labels of episodes of the run can be corrected."
+                )
             if episode not in self.labels:
                 known = f"0 to {max(self.labels)}" if self.labels else "none yet"
                 raise RefusedError(f"Episode {episode} has no label to change: finished episodes are {known}.")
             if self.labels[episode] is not label:
                 self.labels[episode] = label
-                self._relabelled[episode] = label
+                self._corrected[episode] = label
                 self.on_change(self)
 
-    def take_relabelled(self) -> dict[int, Label]:
+    def take_corrected(self) -> dict[int, Label]:
         """Labels that were changed since the last call, for whoever learns from them."""
         with self._lock:
-            taken, self._relabelled = self._relabelled, {}
+            taken, self._corrected = self._corrected, {}
             return taken
 
     def expect(self, number: int | None) -> None:

@@ -152,7 +152,7 @@ class Replay:
         self._keep(place)
         self._head = place.stop
 
-    def relabel(self, number: int, *, success: bool, demo: bool) -> bool:
+    def correct(self, number: int, *, success: bool, demo: bool) -> bool:
         """Say otherwise how an episode of the run went: its last reward becomes 1 or 0, and it ends there either way.
 
         Returns whether the episode is still here. demo: whether it counts as a demonstration from now on.
@@ -161,7 +161,7 @@ class Replay:
         if index is None:
             return False
         place = self._places[index]
-        place = replace(place, terminated=True, success=success, demo=demo, note={**place.note, "relabelled": True})
+        place = replace(place, terminated=True, success=success, demo=demo, note={**place.note, "corrected": True})
         if self._journal is not None:
             self._journal.complete(place)
         self._label_reward(place)
@@ -346,8 +346,8 @@ class Replay:
             )
         self._journal.repair()
         for (start, stop), place in self._journal.entries():
-            relabelled = place is not None and "relabelled" in place.note
-            index = self._index(place.number) if place is not None and relabelled else None
+            corrected = place is not None and "corrected" in place.note
+            index = self._index(place.number) if place is not None and corrected else None
             if place is not None and index is not None:
                 self._places[index] = place
                 continue
@@ -358,7 +358,7 @@ class Replay:
         if written is not None:
             self._restore(written)
         for place in self._places[self._fixed :]:
-            if "relabelled" in place.note:  # a kill may have come between the label and its reward
+            if "corrected" in place.note:  # a kill may have come between the label and its reward
                 self._label_reward(place)
         return self._places[self._fixed :]
 

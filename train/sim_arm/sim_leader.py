@@ -69,7 +69,7 @@ class SimLeader(Teleoperator):
         """Nothing to do."""
 
     def get_action(self) -> dict[str, Any]:
-        """Joints at which the person holds the leader now. Raises DeviceNotConnectedError, ConfigError without an arm."""
+        """Joints where the person holds the leader now. Raises DeviceNotConnectedError, ConfigError without an arm."""
         if not self._connected:
             raise DeviceNotConnectedError(f"{self} is not connected: call connect() first.")
         world = self._world or self._meet()

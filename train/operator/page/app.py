@@ -148,12 +148,12 @@ def _add_actions(app: "FastAPI", board: Board, control: Control, wake: Callable[
                 raise
         return JSONResponse({"ok": True, "state": str(control.apply(client, event))})
 
-    @app.post("/api/relabel")
+    @app.post("/api/correct")
     async def _(request: Request) -> JSONResponse:
         given = await _body(request, {"episode": int, "label": str})
         if given["label"] not in list(Label):
             raise _NonsenseError(f"Unknown label {given['label'][:40]!r}: expected one of {', '.join(Label)}.")
-        control.relabel(_client(request.query_params, request.headers), given["episode"], Label(given["label"]))
+        control.correct(_client(request.query_params, request.headers), given["episode"], Label(given["label"]))
         return JSONResponse({"ok": True})
 
     @app.post("/api/control")

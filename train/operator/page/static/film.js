@@ -8,9 +8,9 @@ function called(episode) {
 }
 
 export class Films {
-  constructor(request, relabel) {
+  constructor(request, correct) {
     this.request = request;
-    this.relabel = relabel;
+    this.correct = correct;
     this.rows = "";
     this.film = null; // {episode, cameras: [{times, urls, image}], length}
     this.offered = null;
@@ -65,7 +65,7 @@ export class Films {
     labels.className = "labels";
     for (const [label, word] of Object.entries(LABELS)) {
       const name = `Label ${called(entry.episode).toLowerCase()} as ${word.toLowerCase()}`;
-      const button = this.button(word, `${label}-${entry.episode}`, () => this.relabel(entry.episode, label), name);
+      const button = this.button(word, `${label}-${entry.episode}`, () => this.correct(entry.episode, label), name);
       button.dataset.label = label;
       button.setAttribute("aria-pressed", String(entry.label === label));
       button.disabled = !operator || entry.label === null || entry.evaluation;

@@ -287,6 +287,6 @@ document.addEventListener("keyup", (press) => press.key === " " && press.target.
 $("take-control").addEventListener("click", () => post("/api/control", {}));
 
 const cameras = new Cameras($("cameras"), request, () => document.body.classList.contains("online"));
-const films = new Films(request, (episode, label) => post("/api/relabel", { episode, label }));
+const films = new Films(request, (episode, label) => post("/api/correct", { episode, label }));
 setInterval(() => { tick(); online(); }, 500);
 connect();
