@@ -100,7 +100,7 @@ class Agent:
         return None
 
     def inside(self, bounds: Mapping[str, NDArray[Any]] | None) -> NDArray[Any]:
-        """Action dimensions [D], as flags, that end before the environment's bounds (`min`, `max`): more is possible."""
+        """Flags [D] of action dimensions that end before the environment's bounds (`min`, `max`): more is possible."""
         if bounds is None:
             return np.ones(self.policy.action_dims, dtype=bool)
         (scale,) = (step for step in self.postprocessor.steps if isinstance(step, UnnormalizerProcessorStep))
