@@ -16,6 +16,7 @@ from .errors import ConfigError, DataError
 from .hub import HubError, refuse_to_start, retried, said
 from .model import Model
 from .model_card import ModelFacts, as_readme, commands, data_facts
+from .n_step import n_step_return
 from .schema import ACTION, NEXT_REWARD, Batch, Observation
 
 __all__ = ["RLPolicy"]
@@ -189,19 +190,15 @@ class RLPolicy(PreTrainedPolicy):
         s = self.config.settings
         end = self.episode_end.to(like.device)[batch["episode_index"].flatten().long()]
         remaining = (end - batch["index"].flatten().long())[:, None]  # steps to the end of the episode, >= 1
-        step = torch.arange(s.n_step, device=like.device)[None]
-        inside = step < remaining  # [B, n]
         if self.has_reward:
-            rewards = batch[NEXT_REWARD].view(-1, s.n_step).to(like) * inside
+            rewards = batch[NEXT_REWARD].view(-1, s.n_step).to(like)
         else:
-            rewards = (step == remaining - 1).to(like)
-        reward = (rewards * s.discount**step).sum(-1, keepdim=True)
+            rewards = (torch.arange(s.n_step, device=like.device) == remaining - 1).to(like)
         at_last = (remaining - 1).clamp(max=s.n_step - 1)
         # A success is a real termination; an episode that ended without one only ran out of time.
         terminal = (remaining <= s.n_step) & (rewards.gather(1, at_last) > 0)
         window = remaining.clamp(max=s.n_step)
-        discount = s.discount ** window.to(like)
-        return reward, torch.where(terminal, torch.zeros_like(discount), discount), window
+        return *n_step_return(rewards, window, terminal, s.discount), window
 
     def _with_time(self, batch: dict[str, Tensor], key: str) -> Tensor:
         if key not in batch:

@@ -30,7 +30,7 @@ ROOM_MAY_USE: dict[str, tuple[str, ...]] = {
 FLOORS: dict[str, str] = {
     # tensors in, tensors out, never a configuration (up to losses); then networks; then what LeRobot sees
     "lerobot_cqn": (
-        "errors schema|ranges intervals|distributional|augmentation losses settings networks model "
+        "errors schema|ranges intervals|distributional|augmentation|n_step losses settings networks model "
         "critic|actor_critic|learner delta_actions joint_goals|fit_pictures|story|hub base_config "
         "model_card|processors base_policy configuration_cqn|configuration_drqv2 processor_cqn|processor_drqv2 "
         "modeling_cqn|modeling_drqv2"

@@ -16,6 +16,7 @@ from ..clock import REAL, Clock
 from ..config import RunConfig
 from ..interfaces import Environment, Interrupted, Label, Monitor, Outcome, Person, Scenes
 from ..replay.buffer import Replay
+from ..replay.demonstrations import counts_as_demonstration
 from ..replay.episode import Episode
 from ..replay.files import Place
 from ..replay.recorder import Recorder
@@ -149,7 +150,7 @@ class Trainer:
             self.monitor.message(f"Episode {number} had no step.")
             return
         episode = recorder.episode(terminated=outcome.terminated, success=outcome.success)
-        demo = self.config.recipe.relabel and outcome.success
+        demo = counts_as_demonstration(self.config.recipe, success=outcome.success)
         row = {
             "episode": number, "length": len(episode), "success": int(outcome.success),
             "return": float(episode.reward.sum()), "mean_q": mean_q, "taught": sum(recorder.taught),
@@ -169,7 +170,7 @@ class Trainer:
         """Learn from now on what a person says otherwise about finished episodes."""
         for number, label in self.person.take_corrected().items():
             success = label is Label.SUCCESS
-            demo = self.config.recipe.relabel and success
+            demo = counts_as_demonstration(self.config.recipe, success=success)
             if label is Label.DISCARD:
                 there = self.replay.forget(number)
             else:

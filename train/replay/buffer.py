@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from lerobot_cqn.errors import ConfigError, DataError
+from lerobot_cqn.n_step import n_step_return
 from lerobot_cqn.schema import Batch, Observation
 
 from .episode import Episode
@@ -228,17 +229,17 @@ class Replay:
         table = self._table()
         start, length = table["start"][episode], table["length"][episode]
         window = np.minimum(self.n_step, length - step)  # never past the end of the episode
-        offsets = np.arange(self.n_step)
-        inside = offsets < window[:, None]
-        rewards = self._rows["reward"].take((start + step)[:, None] + np.where(inside, offsets, 0)).numpy() * inside
-        reward = (rewards * self.discount**offsets).sum(-1, keepdims=True)
+        ahead = np.minimum(np.arange(self.n_step), window[:, None] - 1)
+        rewards = self._rows["reward"].take((start + step)[:, None] + ahead).double()
         ended = (step + window == length) & table["terminated"][episode]
-        discount = np.where(ended, 0.0, self.discount**window)[:, None]
+        reward, discount = n_step_return(
+            rewards, torch.from_numpy(window)[:, None], torch.from_numpy(ended)[:, None], self.discount
+        )
         return Batch(
             observation=self._observation(start, step),
             action=self._rows["action"].take(start + step),
-            reward=torch.from_numpy(reward.astype(np.float32)),
-            discount=torch.from_numpy(discount.astype(np.float32)),
+            reward=reward.float(),
+            discount=discount.float(),
             next_observation=self._observation(start, step + window),
             demo=torch.from_numpy(self._shown(episode, step)[:, None].astype(np.float32)),
         )

@@ -18,12 +18,17 @@ from lerobot_cqn.errors import DataError
 from lerobot_cqn.schema import NEXT_REWARD
 
 from ..agent import Agent
-from ..config import DatasetSettings
+from ..config import DatasetSettings, Recipe
 from .episode import Episode
 
-__all__ = ["Demonstrations", "load_metadata"]
+__all__ = ["Demonstrations", "counts_as_demonstration", "load_metadata"]
 
 logger = logging.getLogger(__name__)
+
+
+def counts_as_demonstration(recipe: Recipe, *, success: bool) -> bool:
+    """Whether an online episode is sampled as a demonstration: a success is, where the recipe relabels (section 3.3)."""
+    return recipe.relabel and success
 
 
 def load_metadata(settings: DatasetSettings) -> LeRobotDatasetMetadata:
