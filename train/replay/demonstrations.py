@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 
 
 def counts_as_demonstration(recipe: Recipe, *, success: bool) -> bool:
-    """Whether an online episode is sampled as a demonstration: a success is, where the recipe relabels (section 3.3)."""
+    """Whether an online episode counts as a demonstration: a success does, where the recipe relabels (section 3.3)."""
     return recipe.relabel and success
 
 
