@@ -2,14 +2,13 @@
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from .cameras import RENDER_SIZE, make_lean
 from .hil_config import STATE_NAMES, STEP, TASKS, HilSimEnv
 from .hil_expert import HilTeleoperator
-from .sim_env import MujocoEnv, Observation, preserved_numpy_random
+from .sim_env import MujocoEnv, Observation, box_with_gripper, preserved_numpy_random
 from .simulator import load_mujoco, needed
 
 __all__ = ["HilSim"]
@@ -58,8 +57,7 @@ class HilSim(MujocoEnv):
         self.state_names = list(STATE_NAMES)
         self.action_names = ["delta_x", "delta_y", "delta_z", "gripper"]
         self.environment_state_names = [f"{name}.{axis}" for name in self.objects for axis in "xyz"]
-        lowest = np.array([-1.0, -1.0, -1.0, 0.0], np.float32)
-        self.action_space = gym.spaces.Box(lowest, np.ones(4, np.float32), dtype=np.float32)
+        self.action_space = box_with_gripper(3, 1.0)
 
     def _begin(self, seed: int | None) -> Observation:
         """Lay the scene out; an episode follows from its seed alone."""

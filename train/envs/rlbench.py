@@ -7,14 +7,13 @@ and tested with a stand-in, not with the simulator.
 import weakref
 from typing import Any, ClassVar, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_cqn.errors import ConfigError, DataError
 
 from .rlbench_config import CAMERAS, RLBenchEnv
-from .sim_env import Observation, SimEnv, preserved_numpy_random
+from .sim_env import Observation, SimEnv, box_with_gripper, preserved_numpy_random
 
 __all__ = ["MAX_DELTA", "RLBenchGym"]
 
@@ -71,8 +70,7 @@ class RLBenchGym(SimEnv):
         self.task_description = self.task.replace("_", " ")
         self.state_names = list(_NAMES)
         self.action_names = list(_NAMES)
-        limits = np.array([MAX_DELTA] * _JOINTS + [1.0], np.float32)
-        self.action_space = gym.spaces.Box(np.append(-limits[:_JOINTS], np.float32(0.0)), limits, dtype=np.float32)
+        self.action_space = box_with_gripper(_JOINTS, MAX_DELTA)
         self._last: Observation = {}
         self._simulator = modules.environment.Environment(
             action_mode=modules.action_mode.MoveArmThenGripper(

@@ -13,7 +13,7 @@ from lerobot_cqn.errors import DataError
 from .cameras import Cameras
 from .env_config import SimEnvConfig
 
-__all__ = ["MujocoEnv", "Observation", "SimEnv", "preserved_numpy_random"]
+__all__ = ["MujocoEnv", "Observation", "SimEnv", "box_with_gripper", "preserved_numpy_random"]
 
 Observation = dict[str, Any]
 
@@ -96,6 +96,13 @@ class MujocoEnv(SimEnv):
         """Views of the observed cameras, by name; `in_model` has the model's name for a camera where that differs."""
         names, size = in_model or {}, self._image_size
         return {name: self._cameras.picture(data, names.get(name, name), size, size) for name in self._camera_names}
+
+
+def box_with_gripper(numbers: int, limit: float) -> gym.spaces.Box:
+    """Space of so many float32 within -`limit` and `limit`, and of a gripper within 0 and 1 behind them."""
+    highest = np.array([limit] * numbers + [1.0], np.float32)
+    lowest = np.append(-highest[:numbers], np.float32(0.0))
+    return gym.spaces.Box(lowest, highest, dtype=np.float32)
 
 
 @contextlib.contextmanager

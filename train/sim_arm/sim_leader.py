@@ -119,7 +119,7 @@ class SimLeader(Teleoperator):
                 self._enter("hold", world)
                 return
             action = self._person.act()
-            self._joints = world.leashed(self._joints + action[:6])
+            self._joints = world.arm.leashed(self._joints + action[:6])
             self._closure = float(action[6])
         elif self.phase == "hold" and held >= self.config.hold_s:
             self._enter("home", world)

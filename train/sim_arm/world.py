@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +10,8 @@ from lerobot_cqn.errors import ConfigError, one_of
 
 from ..clock import Clock
 from ..envs.cameras import Cameras
-from ..envs.ur5e_station.station import LEASH, MAX_JOINT_SPEED
+from ..envs.sim_env import box_with_gripper
+from ..envs.ur5e_station.station import MAX_JOINT_SPEED
 from ..envs.ur5e_station.task import Task
 from ..envs.ur5e_station.tasks import TASKS
 from ..envs.ur5e_station.ur5e import HOME, TIMESTEP, Arm
@@ -56,8 +56,7 @@ class World:
         self._cameras = Cameras(self.arm.model)
         self._painter = ThreadPoolExecutor(1, "painter")  # a graphics context belongs to one thread; a robot to all
         self.clock, self.lock = clock, clock.lock()
-        limits = np.array([MAX_JOINT_SPEED / self.fps] * 6 + [1.0], np.float32)
-        self.action_space = gym.spaces.Box(np.append(-limits[:6], np.float32(0.0)), limits, dtype=np.float32)
+        self.action_space = box_with_gripper(6, MAX_JOINT_SPEED / self.fps)
         self.speed, self.ramp_s = speed, ramp_s
         self.now, self.scenes = 0.0, 0
         self._stuck: tuple[int, float] | None = None
@@ -113,13 +112,8 @@ class World:
         with self.lock:
             self.catch_up()
             self._start = self._reference
-            self._goal = self.leashed(joints)
+            self._goal = self.arm.leashed(joints)
             self._closure, self._since = float(np.clip(closure, 0.0, 1.0)), 0.0
-
-    def leashed(self, joints: Array) -> Array:
-        """The nearest joints (6,) rad within the limits and within reach of the measured ones."""
-        measured = self.arm.joints
-        return self.arm.clip(np.clip(joints, measured - LEASH, measured + LEASH))
 
     def jam(self, joint: int | None) -> None:
         """Keep a joint where it is from now on, whatever it is told; None lets go."""

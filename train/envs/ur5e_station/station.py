@@ -2,22 +2,20 @@
 
 from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras import RENDER_SIZE
-from ..sim_env import MujocoEnv, Observation
+from ..sim_env import MujocoEnv, Observation, box_with_gripper
 from .config import UR5eStationEnv
 from .expert import ScriptedTeleoperator
 from .task import Task
 from .tasks import TASKS
 from .ur5e import HOME, STATE_NAMES, TIMESTEP, Arm
 
-__all__ = ["LEASH", "MAX_JOINT_SPEED", "UR5eStation"]
+__all__ = ["MAX_JOINT_SPEED", "UR5eStation"]
 
 MAX_JOINT_SPEED = 1.0  # rad/s
-LEASH = 0.25  # rad, how far the command may run ahead of the measured joint
 _HOME_SPREAD = 0.03  # rad, of each joint at the start
 
 
@@ -62,13 +60,9 @@ class UR5eStation(MujocoEnv):
         self.state_names = list(STATE_NAMES)
         self.action_names = list(STATE_NAMES)
         self.environment_state_names = list(self.station_task.state_names)
-        limits = np.array([MAX_JOINT_SPEED / self.fps] * 6 + [1.0], np.float32)
-        lowest = np.append(-limits[:6], np.float32(0.0))
-        self.action_space = gym.spaces.Box(lowest, limits, dtype=np.float32)
+        self.action_space = box_with_gripper(6, MAX_JOINT_SPEED / self.fps)
         # A joint may touch its stop and give a little.
-        highest = np.array([2 * np.pi + 0.1] * 6 + [1.0], np.float32)
-        lowest = np.append(-highest[:6], np.float32(0.0))
-        self.observation_space.spaces["agent_pos"] = gym.spaces.Box(lowest, highest, dtype=np.float32)
+        self.observation_space.spaces["agent_pos"] = box_with_gripper(6, 2 * np.pi + 0.1)
 
     def _begin(self, seed: int | None) -> Observation:
         """Place arm and objects; an episode follows from its seed alone."""
@@ -86,9 +80,7 @@ class UR5eStation(MujocoEnv):
             DataError: the action is not seven finite numbers.
         """
         checked = self._checked(action)
-        measured = self.arm.joints
-        wanted: NDArray[np.float64] = np.clip(self._command + checked[:6], measured - LEASH, measured + LEASH)
-        wanted = self.arm.clip(wanted)
+        wanted = self.arm.leashed(self._command + checked[:6])
         self.arm.drive(self._command, wanted, float(checked[6]), self._substeps)
         self._command = wanted
         success = self.station_task.success(self.arm)

@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 STATE_NAMES = (*(f"{name}.pos" for name in JOINTS), "gripper.pos")
 TIMESTEP = 0.004  # s, physics
+_LEASH = 0.25  # rad, how far a command may run ahead of the measured joint
 GRIPPER_TRAVEL = 0.07  # m, each finger
 LEAD_S = 0.04  # s: actuator damping over stiffness; the command leads by this times its velocity
 # The closed fingertips 0.38 m above the table's (0.48, 0), tool down, fingers opening along y (rad).
@@ -263,9 +264,10 @@ class Arm:
         self._mujoco.mj_jacSite(self.model, self.data, linear, angular, self._tip)
         return np.vstack([linear, angular])[:, self._dofs]
 
-    def clip(self, joints: Array) -> Array:
-        """`joints` (6,) rad within the joint limits."""
-        return np.clip(joints, *self._reach)
+    def leashed(self, joints: Array) -> Array:
+        """The nearest joints (6,) rad within the limits and within reach of the measured ones."""
+        measured = self.joints
+        return np.clip(np.clip(joints, measured - _LEASH, measured + _LEASH), *self._reach)
 
     def place(self, joints: Array, closure: float) -> None:
         """Start of an episode: everything at rest, the arm at `joints` (6,) rad, the gripper at `closure`."""
