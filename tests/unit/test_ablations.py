@@ -93,9 +93,9 @@ def test_imitation_off() -> None:
 
 def test_scalar_values() -> None:
     made = model("--policy.distributional=false")
-    assert made.critic.atoms == 1
+    assert made.critic.shape.atoms == 1
     assert parts("--policy.distributional=false").keys() == {"rl_loss", "bc_margin_loss", "loss"}
-    assert model().critic.atoms == 51
+    assert model().critic.shape.atoms == 51
 
 
 def test_margin_only() -> None:
