@@ -3,7 +3,7 @@
 output_dir/checkpoints/<env step>/pretrained_model/   what lerobot-eval loads
                                  /training_state/     optimiser, counters, random state
 output_dir/checkpoints/last -> <env step>
-output_dir/replay/                                    the episodes, written as they end (storage.py)
+output_dir/replay/                                    the episodes, written as they end (replay/files.py)
 """
 
 import json

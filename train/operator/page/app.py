@@ -1,4 +1,4 @@
-"""The routes of the operator's page. Everything but the page itself passes the token first (guard.py)."""
+"""The routes of the operator's page. Everything but the page itself passes the token first (access.py)."""
 
 import asyncio
 import contextlib
