@@ -13,7 +13,7 @@ from torch import Tensor
 from . import processors  # noqa: F401  # registers the steps that checkpoints name
 from .base_config import RLConfig
 from .errors import ConfigError, DataError
-from .hub import HubError, refuse_to_start, retried, said
+from .hub_retry import HubError, refuse_to_start, retried, said
 from .model import Model
 from .model_card import ModelFacts, as_readme, commands, data_facts
 from .n_step import n_step_return

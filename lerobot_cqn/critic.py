@@ -6,8 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from .discretisation import decode, encode, previous_centres, snap, zoom
 from .distributional import expectation, project_onto_support
-from .intervals import decode, encode, previous_centres, snap, zoom
 from .losses import (
     demo_mean,
     dominance_loss,

@@ -16,9 +16,9 @@ import yaml
 from huggingface_hub import EvalResult, ModelCardData
 
 from .base_config import RLConfig
+from .history_text import code, plain, rows_of, tell
 from .joint_goals import converted_deltas
 from .schema import ACTION, dimension_names, read_history
-from .story import code, plain, rows_of, tell
 
 __all__ = [
     "Commands",

@@ -14,8 +14,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import StreamingVideoEncoder
 
 from lerobot_cqn.errors import OutputError
+from lerobot_cqn.history_text import numbered
 from lerobot_cqn.schema import HISTORY, read_history
-from lerobot_cqn.story import numbered
 
 from .folders import new_folder
 

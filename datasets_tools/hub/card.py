@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_cqn.history_text import code, plain, rows_of, tell
 from lerobot_cqn.schema import ACTION, NEXT_REWARD, NEXT_SUCCESS, dimension_names
-from lerobot_cqn.story import code, plain, rows_of, tell
 
 from ..disk.pictures import picture_size
 from ..disk.source import Source

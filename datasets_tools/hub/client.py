@@ -26,7 +26,7 @@ from huggingface_hub.utils import build_hf_headers, hf_raise_for_status  # type:
 from rich.console import Console
 
 from lerobot_cqn.errors import CQNError, DataError
-from lerobot_cqn.hub import PASSING, HubError, cause, passing, retried, said, transport
+from lerobot_cqn.hub_retry import PASSING, HubError, cause, passing, retried, said, transport
 
 from ..terminal.console import Interrupted, note, progress
 from .files import Content, Hashes, batches, size_of

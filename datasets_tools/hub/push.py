@@ -54,7 +54,7 @@ def main(args: list[str]) -> None:
     config = parse(PushConfig, args)
     config.validate()
     if not config.dry_run:
-        from lerobot_cqn.hub import refuse_to_start
+        from lerobot_cqn.hub_retry import refuse_to_start
 
         refuse_to_start()
     load_lerobot()

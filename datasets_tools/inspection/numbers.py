@@ -19,7 +19,7 @@ from ..decisions.pause_threshold import Motion, Suggestion
 from ..decisions.pauses import pause_runs
 from ..disk.source import Source
 from ..views.episode import Episode
-from .follow import Follow
+from .action_lag import Follow
 
 __all__ = ["DRAWN", "Dimension", "EpisodeNumbers", "Jump", "Numbers", "measure"]
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from lerobot_cqn.errors import ConfigError, DataError
-from lerobot_cqn.story import numbered
+from lerobot_cqn.history_text import numbered
 
 from ..terminal.console import result, table
 from ..terminal.options import option

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lerobot_cqn.errors import ConfigError, DataError, one_of
+from lerobot_cqn.history_text import numbered, shown
 from lerobot_cqn.schema import ACTION, STATE, dimension_names
-from lerobot_cqn.story import numbered, shown
 
 from ..disk.folders import refuse_existing
 from ..terminal.console import note, result, table

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from lerobot_cqn.errors import ConfigError, one_of
-from lerobot_cqn.story import shown
+from lerobot_cqn.history_text import shown
 
 from ..terminal.console import note, table
 from .job import Step, settings_of

@@ -89,7 +89,7 @@ OFFENCES = [
     ("check_relative", "datasets_tools/cli.py", "import datasets_tools.trim"),
     ("check_installed_names", "train/cli.py", "from datasets_tools import trim"),
     ("check_installed_names", "tests/unit/test_x.py", "import train.replay"),
-    ("check_floors", "lerobot_cqn/intervals.py", "from .configuration_cqn import CQNConfig"),
+    ("check_floors", "lerobot_cqn/discretisation.py", "from .configuration_cqn import CQNConfig"),
     ("check_floors", "lerobot_cqn/losses.py", "from lerobot_cqn.networks import Stream"),
     ("check_floors", "lerobot_cqn/critic.py", "from . import learner"),
     ("check_floors", "lerobot_cqn/critic.py", "import lerobot_cqn"),

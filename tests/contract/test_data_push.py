@@ -54,7 +54,7 @@ def hub(monkeypatch):
     with HubServer() as server:
         server.connect(monkeypatch)
         server.waits = []
-        monkeypatch.setattr("lerobot_cqn.hub.pause", server.waits.append)
+        monkeypatch.setattr("lerobot_cqn.hub_retry.pause", server.waits.append)
         monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda seconds: None)
         yield server
         close_session()

@@ -21,7 +21,7 @@ from cqn_train.arguments import parse
 from cqn_train.build import build
 from cqn_train.run.progress import ConsoleMonitor
 from cqn_train.run.stop import StopRequest
-from lerobot_cqn.intervals import snap
+from lerobot_cqn.discretisation import snap
 
 from .conftest import STATION, TINY_POLICY, TINY_RUN, Command
 

@@ -33,8 +33,8 @@ def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[HubServer]:
     """The Hub, for this process; nobody waits between tries."""
     with HubServer() as server:
         server.connect(monkeypatch)
-        monkeypatch.setattr("lerobot_cqn.hub.pause", lambda seconds: None)
-        monkeypatch.setattr("lerobot_cqn.hub.pause", lambda seconds: None)
+        monkeypatch.setattr("lerobot_cqn.hub_retry.pause", lambda seconds: None)
+        monkeypatch.setattr("lerobot_cqn.hub_retry.pause", lambda seconds: None)
         monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda seconds: None)
         yield server
         close_session()

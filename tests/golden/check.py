@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from lerobot_cqn.critic import CQNModel, Features
-from lerobot_cqn.intervals import decode, encode
+from lerobot_cqn.discretisation import decode, encode
 from lerobot_cqn.learner import Learner
 from lerobot_cqn.losses import demo_mean, dominance_loss, margin_loss, q_learning_loss
 from lerobot_cqn.networks import CoarseToFineNetwork, NetworkShape, ViewEncoder

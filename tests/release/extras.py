@@ -107,7 +107,7 @@ def _develop(environment: Environment, inputs: Path) -> str:
     source = str(inputs / "source")
     environment.succeed("ruff", "check", source)
     environment.succeed("mypy", f"--config-file={source}/pyproject.toml", f"{source}/lerobot_cqn", timeout=400)
-    tests = [f"{source}/tests/unit/test_{name}.py" for name in ("intervals", "distributional", "losses")]
+    tests = [f"{source}/tests/unit/test_{name}.py" for name in ("discretisation", "distributional", "losses")]
     environment.succeed("python", "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests, timeout=300)
     return f"ruff, mypy, pytest on {len(tests)} files of a clean checkout"
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lerobot_cqn.critic import CQNModel
-from lerobot_cqn.intervals import encode, snap
+from lerobot_cqn.discretisation import encode, snap
 from lerobot_cqn.learner import Learner, NonFiniteLossError
 from lerobot_cqn.losses import margin_loss, take_bin
 from lerobot_cqn.schema import Batch, Observation

@@ -14,7 +14,7 @@ from cqn_data.operations.job import Job, run_job
 from cqn_data.operations.recipe import load_recipe
 from cqn_data.operations.registry import STEPS, step_class
 from lerobot_cqn.errors import DataError
-from lerobot_cqn.story import tell, told
+from lerobot_cqn.history_text import tell, told
 
 from ..toy_datasets import CAMERA, make_dataset
 

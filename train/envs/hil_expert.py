@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .hil_config import STEP
-from .pauses import Pauses
+from .scripted_pauses import Pauses
 
 __all__ = ["HilTeleoperator"]
 

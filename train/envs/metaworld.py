@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from .cameras import RENDER_SIZE, make_lean
 from .metaworld_config import SIMULATOR_HZ, TASKS, MetaworldSparseEnv, state_size
-from .pauses import Pauses
+from .scripted_pauses import Pauses
 from .sim_env import MujocoEnv, Observation
 from .simulator import load_mujoco, needed
 

@@ -14,7 +14,7 @@ from cqn_data.hub.readme import Readme, union
 from cqn_data.hub.report import megabytes, show_dry, show_sent
 from cqn_data.terminal.console import note, result
 from lerobot_cqn.errors import DataError
-from lerobot_cqn.hub import refuse_to_start
+from lerobot_cqn.hub_retry import refuse_to_start
 from lerobot_cqn.model_card import ModelFacts, front_matter, write_part
 
 from .. import envs  # noqa: F401  # registers our environments

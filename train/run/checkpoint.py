@@ -1,9 +1,12 @@
-"""Checkpoints in LeRobot's layout, written whole or not at all, and everything a resumed run needs.
+"""Checkpoints in LeRobot's layout, written whole or not at all, and what a resumed run restores from them.
 
 output_dir/checkpoints/<env step>/pretrained_model/   what lerobot-eval loads
                                  /training_state/     optimiser, counters, random state
 output_dir/checkpoints/last -> <env step>
 output_dir/replay/                                    the episodes, written as they end (replay/files.py)
+
+A resumed run (build.py) loads weights and processors from the one, restores the other here, cuts its tables back to the
+checkpoint, and takes up the episodes that ended since.
 """
 
 import json

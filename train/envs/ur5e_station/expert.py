@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.errors import ConfigError
 
-from ..pauses import Pauses
+from ..scripted_pauses import Pauses
 from .task import Goal, Task
 from .ur5e import Arm
 

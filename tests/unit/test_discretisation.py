@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from lerobot_cqn.intervals import decode, encode, previous_centres, snap, zoom
+from lerobot_cqn.discretisation import decode, encode, previous_centres, snap, zoom
 
 LEVELS, BINS = st.integers(1, 5), st.integers(2, 9)
 ACTIONS = st.lists(st.floats(-1, 1, width=32), min_size=1, max_size=16).map(torch.tensor)

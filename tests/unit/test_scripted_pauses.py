@@ -5,7 +5,7 @@ from itertools import groupby
 import numpy as np
 import pytest
 
-from cqn_train.envs.pauses import Pauses
+from cqn_train.envs.scripted_pauses import Pauses
 from lerobot_cqn.errors import ConfigError
 
 
