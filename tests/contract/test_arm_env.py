@@ -292,7 +292,7 @@ def test_an_episode_a_pause_and_a_stop_with_threads_that_nobody_drives() -> None
         for step in range(5):
             assert not arm.step(2.0 * (step + 1)).ended
         arm.meanwhile(lambda: (REAL.sleep(0.4 / FPS), arm.do(Event.PAUSE), REAL.sleep(0.05), arm.do(Event.RESUME)))
-        assert arm.step(12).skipped
+        assert any(arm.step(12).skipped for _ in range(400))  # whenever the other thread gets its turn
         arm.do(Event.SUCCESS)
         assert arm.step(14).success
         arm.soon(lambda: np.abs(arm.joints - HOME_DEG[:6]).max() < 0.5)
