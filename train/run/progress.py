@@ -4,7 +4,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
 from rich.progress import (
@@ -17,7 +17,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from ..interfaces import Monitor
+if TYPE_CHECKING:
+    from ..interfaces import Monitor  # which needs PyTorch, and the bench shows progress without
 
 __all__ = ["ConsoleMonitor", "Monitors", "last_line"]
 
@@ -89,7 +90,7 @@ def last_line(log: Path, begin: str = "") -> str:
 class Monitors:
     """Several places that show the same progress."""
 
-    def __init__(self, monitors: Sequence[Monitor]) -> None:
+    def __init__(self, monitors: "Sequence[Monitor]") -> None:
         self.monitors = monitors
 
     def phase(self, name: str, total: int, done: int) -> None:
