@@ -64,8 +64,7 @@ ARM = [
 ]  # fmt: skip
 
 
-@pytest.fixture(autouse=True)
-def clock(monkeypatch: pytest.MonkeyPatch) -> DrivenClock:
+def drive(monkeypatch: pytest.MonkeyPatch) -> DrivenClock:
     """By which trainer, arm and person live; a thread steers the session itself, since keys would need a terminal."""
     clock = DrivenClock()
     monkeypatch.setattr(cli, "steering", lambda *_: contextlib.nullcontext())
@@ -73,6 +72,11 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> DrivenClock:
     monkeypatch.setattr(cli, "Trainer", functools.partial(Trainer, clock=clock))
     monkeypatch.setattr(SimUR5e, "clock", clock)
     return clock
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch: pytest.MonkeyPatch) -> DrivenClock:
+    return drive(monkeypatch)
 
 
 class Hands:
