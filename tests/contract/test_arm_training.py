@@ -63,13 +63,17 @@ ARM = [
 ]  # fmt: skip
 
 
-@pytest.fixture(autouse=True)
-def clock(monkeypatch: pytest.MonkeyPatch) -> DrivenClock:
+def drive(monkeypatch: pytest.MonkeyPatch) -> DrivenClock:
     """By which trainer, arm and person live; a thread steers the session itself, since keys would need a terminal."""
     clock = DrivenClock()
     monkeypatch.setattr("cqn_train.build.steering", lambda *_: contextlib.nullcontext())
     monkeypatch.setattr(SimUR5e, "clock", clock)
     return clock
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch: pytest.MonkeyPatch) -> DrivenClock:
+    return drive(monkeypatch)
 
 
 class Hands:

@@ -1,6 +1,5 @@
 """The listings of docs/extending.md and the commands of the tutorial, run as they are printed, with few steps."""
 
-import contextlib
 import logging
 import os
 import re
@@ -18,13 +17,13 @@ from lerobot.scripts import lerobot_eval
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from cqn_data.cli import main as cqn_data
-from cqn_train import cli
 from cqn_train.cli import main as cqn_train
 from cqn_train.operator.session import Event
 from cqn_train.push.cli import main as cqn_push
 
 from .conftest import TINY_POLICY
 from .documents import ROOT, Command, commands, listings
+from .test_arm_training import drive
 from .test_arm_training import run as arm_session
 
 EXTENDING, TUTORIAL = ROOT / "docs" / "extending.md", ROOT / "docs" / "tutorial.md"
@@ -131,7 +130,7 @@ def test_the_robot_of_extending_is_trained_on(shop: Path, tmp_path: Path, monkey
             data.add_frame({"action": joints + 1, "observation.state": joints, "task": "Move."})
         data.save_episode()
     data.finalize()
-    monkeypatch.setattr(cli, "steering", lambda *_: contextlib.nullcontext())
+    drive(monkeypatch)
     options = ["--robot.type=pair", "--operator_page=false", "--batch_size=4", "--demo_batch_size=4", "--log_freq=1"]
     source = ["--dataset.repo_id=local/pair", f"--dataset.root={tmp_path / 'data'}", f"--output_dir={tmp_path / 'run'}"]
     plan = [Event.SUCCESS, Event.FAILURE]

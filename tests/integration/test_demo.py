@@ -6,7 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
 from rich.console import Console
 
 from cqn_train.demo.stages import Stages
@@ -17,7 +16,6 @@ TINY = (
 )  # fmt: skip
 
 
-@pytest.mark.timeout(600)
 def test_demo_runs_every_arrow_and_a_second_start_does_not_repeat_it(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     command = [sys.executable, "-m", "cqn_train.demo.station", f"--output_dir={out}", *TINY]
