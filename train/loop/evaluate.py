@@ -1,7 +1,7 @@
 """Success rate of the deterministic policy over fresh episodes, with its 95 % interval."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from math import sqrt
 from typing import Any
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..agent import Agent
 from ..interfaces import Scenes
+from ..replay.standing import stands
 
 __all__ = ["EVAL_SEED", "Evaluation", "evaluate", "wilson_interval"]
 
@@ -22,12 +23,14 @@ EVAL_SEED = 2_147_000_000
 class Evaluation:
     """Result of evaluation episodes.
 
-    outcomes: success; steps: lengths; returns: sums of rewards; frames: pictures of the first episodes.
+    outcomes: success; steps: lengths; returns: sums of rewards; standing: steps in which nothing moved; frames:
+    pictures of the first episodes.
     """
 
-    outcomes: list[bool]
-    steps: list[int]
-    returns: list[float]
+    outcomes: list[bool] = field(default_factory=list)
+    steps: list[int] = field(default_factory=list)
+    returns: list[float] = field(default_factory=list)
+    standing: list[int] = field(default_factory=list)
     frames: list[list[NDArray[Any]]] = field(default_factory=list)
 
     @property
@@ -49,6 +52,14 @@ class Evaluation:
     def mean_return(self) -> float:
         """Mean sum of rewards of an episode."""
         return float(np.mean(self.returns))
+
+    @property
+    def standing_failures(self) -> float | None:
+        """Share of the steps of failed episodes in which nothing moved; None where none failed or there is no state."""
+        failed = [i for i, success in enumerate(self.outcomes) if not success]
+        if not failed or not self.standing:
+            return None
+        return sum(self.standing[i] for i in failed) / max(1, sum(self.steps[i] for i in failed))
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -86,30 +97,25 @@ def evaluate(
 
     film: episodes to take pictures of. Episode i has seed + i, however many run at a time.
     """
-    outcomes: list[bool] = []
-    steps: list[int] = []
-    returns: list[float] = []
-    films: list[list[NDArray[Any]]] = []
+    total = Evaluation()
     for first in range(0, episodes, scenes.count):
-        numbers = range(first, min(first + scenes.count, episodes))
-        success, length, total, pictures = _wave(agent, scenes, seed + first, max(0, film - first))
-        outcomes += success.tolist()[: len(numbers)]
-        steps += length.tolist()[: len(numbers)]
-        returns += total.tolist()[: len(numbers)]
-        films += pictures[: len(numbers)]
-        on_episode(numbers[-1] + 1)
-    return Evaluation(outcomes, steps, returns, films[:film])
+        wave = _wave(agent, scenes, seed + first, max(0, film - first))
+        count = min(scenes.count, episodes - first)
+        for field_ in fields(Evaluation):
+            getattr(total, field_.name).extend(getattr(wave, field_.name)[:count])
+        on_episode(first + count)
+    return total
 
 
-def _wave(
-    agent: Agent, scenes: Scenes, seed: int, film: int
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], list[list[NDArray[Any]]]]:
-    """One episode in each scene: success, length and return [K], and pictures of the first `film`."""
+def _wave(agent: Agent, scenes: Scenes, seed: int, film: int) -> Evaluation:
+    """One episode in each scene, with pictures of the first `film`."""
     agent.reset()
-    frame = scenes.reset([seed + k for k in range(scenes.count)])
-    running, success = np.ones(scenes.count, dtype=bool), np.zeros(scenes.count, dtype=bool)
-    length, total = np.zeros(scenes.count, dtype=int), np.zeros(scenes.count)
-    films: list[list[NDArray[Any]]] = [[] for _ in range(min(film, scenes.count))]
+    count = scenes.count
+    frame = scenes.reset([seed + k for k in range(count)])
+    running, success = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
+    length, standing, total = np.zeros(count, dtype=int), np.zeros(count, dtype=int), np.zeros(count)
+    films: list[list[NDArray[Any]]] = [[] for _ in range(min(film, count))]
+    before: NDArray[Any] | None = None
 
     def look() -> None:
         pictures = scenes.render() if running[: len(films)].any() else []
@@ -119,7 +125,12 @@ def _wave(
 
     while running.any() and length.max() < scenes.max_steps:
         look()
-        action, _ = agent.act(agent.prepare(frame), explore=False)
+        prepared = agent.prepare(frame)
+        state = agent.low_dim(prepared)
+        if before is not None and state is not None:
+            standing += running & stands(before, state)
+        before = state
+        action, _ = agent.act(prepared, explore=False)
         outcome = scenes.step(agent.postprocessor(action))
         frame = outcome.frame
         if outcome.skipped:
@@ -129,6 +140,7 @@ def _wave(
         success |= running & outcome.success
         running &= ~outcome.ended
     # The last picture of an episode that ends together with the others; one that ended before has begun anew.
-    if scenes.count == 1 and films:
+    if count == 1 and films:
         films[0].append(scenes.render()[0])
-    return success, length, total, films
+    stood = [] if before is None else standing.tolist()
+    return Evaluation(success.tolist(), length.tolist(), total.tolist(), stood, films)

@@ -20,9 +20,11 @@ from ..replay.demonstrations import counts_as_demonstration
 from ..replay.episode import Episode
 from ..replay.files import Place
 from ..replay.recorder import Recorder
+from ..replay.standing import share_standing
 from ..run.checkpoint import Counters
 from ..run.first_look import save_batch, write_films
-from ..run.metrics import Metrics
+from ..run.metrics import Metrics, read_rows
+from ..run.report import unconverged
 from .background import Background
 from .evaluate import Evaluation, evaluate
 
@@ -77,6 +79,12 @@ class Trainer:
         self.monitor.phase("offline", total, self.counters.updates)
         self.person.learning("offline updates")
         self.updates(total - self.counters.updates, on_update=lambda: self.monitor.advance(self.counters.updates, ""))
+        fell = unconverged(read_rows(self.metrics.output_dir / "updates.csv"))
+        if fell is not None:
+            self.monitor.message(
+                f"Imitation has not converged: its loss fell by {fell:.0%} in the last tenth of the offline updates; "
+                "give more --offline_updates."
+            )
         if total and self.config.steps:
             self.evaluate("offline", self.config.final_episodes)
         self.counters.offline_done = True
@@ -153,8 +161,8 @@ class Trainer:
         demo = counts_as_demonstration(self.config.recipe, success=outcome.success)
         row = {
             "episode": number, "length": len(episode), "success": int(outcome.success),
-            "return": float(episode.reward.sum()), "mean_q": mean_q, "taught": sum(recorder.taught),
-            "demonstrations": self.replay.demonstrations + demo, **self._progress(),
+            "return": float(episode.reward.sum()), "mean_q": mean_q, "standing": share_standing(episode.low_dim),
+            "taught": sum(recorder.taught), "demonstrations": self.replay.demonstrations + demo, **self._progress(),
         }  # fmt: skip
         if outcome.discarded:
             self._aside = dict([*self._aside.items(), (number, (episode, row))][-SET_ASIDE:])
@@ -263,6 +271,7 @@ class Trainer:
             "phase": phase, "episodes": self.counters.episodes, "n": result.n, "successes": result.successes,
             "success_rate": result.success_rate, "ci_low": low, "ci_high": high,
             "mean_length": float(np.mean(result.steps)), "mean_return": result.mean_return,
+            "standing_failures": result.standing_failures,
         }  # fmt: skip
         self.metrics.write("evaluations", row | self._progress())
         self.monitor.message(f"{phase:>8}  step {self.counters.env_steps:>6}  {result}")

@@ -17,12 +17,12 @@ COLUMNS: dict[str, tuple[str, ...]] = {
         "bc_action_loss", "wall_s",
     ),
     "episodes": (
-        "episode", "env_steps", "updates", "length", "success", "return", "mean_q", "taught", "demonstrations",
-        "wall_s",
+        "episode", "env_steps", "updates", "length", "success", "return", "mean_q", "standing", "taught",
+        "demonstrations", "wall_s",
     ),
     "evaluations": (
         "phase", "env_steps", "updates", "episodes", "n", "successes", "success_rate", "ci_low", "ci_high",
-        "mean_length", "mean_return", "wall_s",
+        "mean_length", "mean_return", "standing_failures", "wall_s",
     ),
 }  # fmt: skip
 
