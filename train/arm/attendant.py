@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from ..clock import REAL, Clock
 from ..operator.session import IN_MOTION, Event, RefusedError, Session, State
 from ..robot.arm import Arm
-from ..robot.guard import HeldError, RobotFault, StoppedError
+from ..robot.guard import HeldError, StoppedError
+from ..robot.readings import RobotFault
 
 __all__ = ["Attendant"]
 

@@ -38,6 +38,7 @@ __all__ = ["Operated", "make_operated", "recall", "steering"]
 Array = NDArray[np.float64]
 # Of a joint's range: the largest step where actions are goals, so that none says how far is usual.
 ABSOLUTE_SHARE = 0.05
+CURRENT_S = 0.3  # that a reading may be old, and no less than two control steps
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def make_operated(
     home = home_of(demonstrations, robot, config.arm) if demonstrations is not None or config.arm.home else None
     names = tuple(robot.action_features)
     _check_home(home, names, limits)
-    settings = GuardSettings(config.arm.stale_s, config.arm.watchdog_s)
+    settings = GuardSettings(config.arm.stale_s, config.arm.watchdog_s, current_s=max(CURRENT_S, 2 / fps))
     clutched = [i for i, name in enumerate(names) if "gripper" not in name]
     arm = Arm(Guard(robot, limits, settings, clock), config.arm, fps, leader=leader, clutched=clutched, home=home)
     if agent.deltas is None:

@@ -12,8 +12,9 @@ from ..clock import REAL, Clock
 from ..interfaces import Frame, Interrupted, Label, Outcome
 from ..operator.session import IN_MOTION, Event, RefusedError, Session, State
 from ..robot.arm import Arm
-from ..robot.guard import HeldError, Reading, RobotFault, StoppedError
+from ..robot.guard import HeldError, StoppedError
 from ..robot.pace import Pace
+from ..robot.readings import Reading, RobotFault
 from .attendant import Attendant
 
 __all__ = ["ArmEnvironment", "Display"]
