@@ -62,7 +62,7 @@ class ArmEnvironment:
     ) -> None:
         self.arm, self.session, self.display, self._clock = arm, session, display, clock
         self._should_stop = should_stop
-        self._attendant = Attendant(arm, session, display.show, clock)
+        self._attendant = Attendant(arm, session, display.show, clock, should_stop)
         self._pace = Pace(arm.fps, clock)
         self._steps, self._began = 0, 0.0
         self._frame: Frame = {}

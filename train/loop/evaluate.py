@@ -79,12 +79,13 @@ def evaluate(
     episodes: int,
     *,
     seed: int = EVAL_SEED,
-    on_episode: Callable[[int], None] = lambda _: None,
+    on_step: Callable[[], None] = lambda: None,
     film: int = 0,
 ) -> Evaluation:
     """Run `episodes` episodes without noise, as lerobot-eval does, as many at a time as there are scenes.
 
-    film: episodes to take pictures of. Episode i has seed + i, however many run at a time.
+    on_step: called before each control step; what it raises ends the evaluation. film: episodes to take pictures of.
+    Episode i has seed + i, however many run at a time.
     """
     outcomes: list[bool] = []
     steps: list[int] = []
@@ -92,17 +93,16 @@ def evaluate(
     films: list[list[NDArray[Any]]] = []
     for first in range(0, episodes, scenes.count):
         numbers = range(first, min(first + scenes.count, episodes))
-        success, length, total, pictures = _wave(agent, scenes, seed + first, max(0, film - first))
+        success, length, total, pictures = _wave(agent, scenes, seed + first, max(0, film - first), on_step)
         outcomes += success.tolist()[: len(numbers)]
         steps += length.tolist()[: len(numbers)]
         returns += total.tolist()[: len(numbers)]
         films += pictures[: len(numbers)]
-        on_episode(numbers[-1] + 1)
     return Evaluation(outcomes, steps, returns, films[:film])
 
 
 def _wave(
-    agent: Agent, scenes: Scenes, seed: int, film: int
+    agent: Agent, scenes: Scenes, seed: int, film: int, on_step: Callable[[], None]
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], list[list[NDArray[Any]]]]:
     """One episode in each scene: success, length and return [K], and pictures of the first `film`."""
     agent.reset()
@@ -118,6 +118,7 @@ def _wave(
                 shown.append(pictures[k])
 
     while running.any() and length.max() < scenes.max_steps:
+        on_step()
         look()
         action, _ = agent.act(agent.prepare(frame), explore=False)
         outcome = scenes.step(agent.postprocessor(action))
