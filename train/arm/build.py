@@ -71,7 +71,8 @@ def make_operated(
     fps = config.arm.fps or (int(demonstrations.meta.fps) if demonstrations is not None else None)
     if fps is None:
         raise ConfigError("How many control steps a second? Give --arm.fps (that of the demonstrations).")
-    limits = limits_of(robot, agent, config.arm, fps)
+    seen_fps = demonstrations.meta.fps if demonstrations is not None else fps
+    limits = limits_of(robot, agent, config.arm, fps, seen_fps)
     home = home_of(demonstrations, robot, config.arm) if demonstrations is not None or config.arm.home else None
     names = tuple(robot.action_features)
     _check_home(home, names, limits)
@@ -142,8 +143,11 @@ def check_robot_fits(robot: Robot, agent: Agent) -> None:
         )
 
 
-def limits_of(robot: Robot, agent: Agent, settings: ArmSettings, fps: int) -> Limits:
+def limits_of(robot: Robot, agent: Agent, settings: ArmSettings, fps: int, seen_fps: float) -> Limits:
     """Limits from what the demonstrations did: their joints with a margin, their largest step with a factor.
+
+    fps: control steps a second; at a higher rate than `seen_fps`, that of the demonstrations, steps are shorter: the
+        speed limit stays.
 
     Raises ConfigError for joints that are not the robot's, or where neither data nor settings say a limit.
     """
@@ -173,6 +177,7 @@ def limits_of(robot: Robot, agent: Agent, settings: ArmSettings, fps: int) -> Li
             step[i] = (high[i] - low[i]) * (1.0 if gripper else settings.step_factor * ABSOLUTE_SHARE)
         margin = settings.joint_margin * (high[i] - low[i])
         low[i], high[i] = settings.joint_limits.get(name, (low[i] - margin, high[i] + margin))
+    step *= min(1.0, seen_fps / fps)
     step = np.maximum(step, 1e-3 * np.maximum(high - low, 1e-6))  # a joint that never moved
     box = None
     if settings.workspace is not None:

@@ -86,7 +86,10 @@ class Guard:
         self.close()
 
     def open(self) -> None:
-        """Connect, read once, start the watchdog. Raises RobotFault when the robot does not answer."""
+        """Connect, read, start the watchdog.
+
+        Raises RobotFault when the robot does not answer, or stands far outside the range of its limits.
+        """
         try:
             if not self.robot.is_connected:
                 self.robot.connect()
@@ -94,7 +97,7 @@ class Guard:
             raise
         except Exception as error:  # drivers raise many kinds
             raise RobotFault(f"The robot cannot be connected: {error} Check cables, power and --robot.port.") from error
-        self.read()
+        self._whereabouts.check_start(self.read().joints)
         self._watchdog = self._clock.thread(self._run, "watchdog")
         self._watchdog.start()
 

@@ -16,6 +16,7 @@ __all__ = ["Agreement", "Contents", "Reading", "RobotFault", "Whereabouts", "Wro
 
 Array = NDArray[np.float64]
 Pictures = Mapping[str, NDArray[np.uint8]]
+START_STEPS = 5  # and no less than the joint's whole range: how far outside of it an arm may be found at the start
 AGREEING = 3  # readings in a row that say the same: where nothing is known yet, one alone proves nothing
 
 
@@ -129,6 +130,20 @@ class Whereabouts:
         self.sure = np.clip(joints, self._low, self._high)
         self._last = joints
         self._low, self._high = np.minimum(joints, goal), np.maximum(joints, goal)
+
+    def check_start(self, joints: Array) -> None:
+        """Raises RobotFault for an arm so far outside the demonstrated range that it may speak in other units."""
+        low, high = self._limits.low, self._limits.high
+        room = np.maximum(high - low, START_STEPS * self.slack)
+        far = np.flatnonzero((joints < low - room) | (joints > high + room))
+        if len(far):
+            i = int(far[0])
+            raise RobotFault(
+                f"The joint '{self._names[i]}' reads {joints[i]:g}, far outside its range of {low[i]:g} to {high[i]:g} "
+                f"(all joints read {joints.min():g} to {joints.max():g}, their ranges are {low.min():g} to "
+                f"{high.max():g}): use the units and the calibration of the demonstrations, or bring the arm near to "
+                "where they start."
+            )
 
     def check_inside(self, joints: Array, goal: Array) -> None:
         """Raises RobotFault for joints beyond the limits, or beyond `goal` where that is farther out."""
