@@ -203,9 +203,13 @@ def bench(
     faults: tuple[Fault, ...] = (),
     should_stop: Callable[[], bool] = lambda: False,
     clock: Clock | None = None,
+    start: Array | None = None,
     **arm: Any,
 ) -> Iterator[Bench]:
-    """The arm connected and held at home, the session waiting. clock: by which all live; None: one of their own."""
+    """The arm connected and held, the session waiting.
+
+    clock: by which all live; None: one of their own. start: joints [6], rad, where it is found; None: home.
+    """
     settings = ArmSettings(**{"episode_s": 60.0, "stale_s": 0.3, "watchdog_s": 0.25, "home_speed": 0.5, **arm})
     clock = clock or DrivenClock()
     robot = make_robot_from_config(
@@ -221,8 +225,12 @@ def bench(
     )
     assert isinstance(robot, SimUR5e)
     robot.clock = clock
+    if start is not None:
+        robot.connect()
+        robot.world.arm.place(start, 0.0)
+        robot.world.lay_out()
     hand = HandLeader()
-    guard = Guard(robot, arm_limits(), GuardSettings(settings.stale_s, settings.watchdog_s, slow_s=0.4), clock)
+    guard = Guard(robot, arm_limits(), GuardSettings(settings.stale_s, settings.watchdog_s, current_s=0.4), clock)
     made = Arm(
         guard, settings, FPS, leader=hand, clutched=range(6), home=HOME_DEG  # type: ignore[arg-type]
     )  # fmt: skip

@@ -143,7 +143,7 @@ def test_keys_that_are_held_or_typed_or_belong_to_the_browser_do_nothing(
     page.evaluate("document.body.append(Object.assign(document.createElement('input'), {id: 'typing'}))")
     page.focus("#typing")
     page.keyboard.press("Space")
-    page.keyboard.press("Escape")
+    page.keyboard.press("s")
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("Control+s")
     for _ in range(5):  # the first is a press, the others are repeats of a key that is down
@@ -152,6 +152,70 @@ def test_keys_that_are_held_or_typed_or_belong_to_the_browser_do_nothing(
     sees(page, State.RUNNING)
     page.wait_for_timeout(300)
     assert board.session.state is State.RUNNING  # and letting go of Space did not press the button in focus
+
+
+OPEN_FILM = "document.querySelector('#player').hidden = false; "
+FOCUS = {
+    "nothing": "document.activeElement.blur()",
+    "the film's slider": f"{OPEN_FILM}document.querySelector('#film-seek').focus()",
+    "the film's button": f"{OPEN_FILM}document.querySelector('#film-play').focus()",
+    "the log": "document.querySelector('#log').focus()",
+    "a field": "document.body.append(Object.assign(document.createElement('input'), {id: 'f'}));"
+    " document.querySelector('#f').focus()",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("focus", FOCUS)
+@pytest.mark.parametrize("held", ["", "Control+", "Alt+", "Meta+", "Shift+"])
+def test_stop_and_pause_come_through_whatever_has_the_focus(
+    server: OperatorServer, board: Board, visit: Callable[..., Any], focus: str, held: str
+) -> None:
+    page = visit(server.url)
+    sees(page, State.WAITING)
+    board.session.apply(Event.START)
+    sees(page, State.RUNNING)
+    page.evaluate(FOCUS[focus])
+    page.keyboard.press(f"{held}Space")
+    sees(page, State.PAUSED)
+    page.evaluate(FOCUS[focus])
+    page.keyboard.press(f"{held}Escape")
+    sees(page, State.STOPPED)
+
+
+def test_an_arm_on_its_way_home_is_paused_by_the_same_key(
+    server: OperatorServer, board: Board, visit: Callable[..., Any]
+) -> None:
+    page = visit(server.url)
+    sees(page, State.WAITING)
+    board.session.note_homing(True)
+    page.wait_for_selector('#controls button[data-event="pause"]:not(:disabled)')
+    page.keyboard.press("Space")
+    page.wait_for_selector('#controls button[data-event="start"]:not(:disabled)')
+    assert (board.session.homing, board.session.state) == (False, State.WAITING)
+
+
+SCREENS = [{"width": width, "height": height} for width, height in ((1366, 650), (1280, 800), (900, 500), (821, 600))]
+
+
+@pytest.mark.parametrize("screen", SCREENS, ids=lambda screen: f"{screen['width']}x{screen['height']}")
+def test_stop_and_pause_are_in_sight_on_every_screen(
+    server: OperatorServer, board: Board, visit: Callable[..., Any], screen: dict[str, int]
+) -> None:
+    board.show({f"camera_{i}": np.full((480, 640, 3), 60 * i, np.uint8) for i in range(4)})
+    page = visit(server.url, viewport=screen)
+    board.session.apply(Event.START)
+    sees(page, State.RUNNING)
+    until(page, "document.querySelectorAll('#cameras img[src]').length >= 4")
+    for top in (0, 100_000):
+        page.evaluate(f"window.scrollTo(0, {top})")
+        for event in ("pause", "stop"):
+            box = button(page, event).bounding_box()
+            assert box["y"] >= 0
+            assert box["y"] + box["height"] <= screen["height"]
+            assert box["x"] + box["width"] <= screen["width"]
+    assert page.evaluate("document.documentElement.scrollWidth") <= screen["width"]
+    last = page.locator("footer").bounding_box()  # scrolled to the end, the bar hides nothing
+    assert last["y"] + last["height"] <= page.locator("#controls").bounding_box()["y"] + 1
 
 
 def test_live_pictures_change_and_one_that_is_old_says_so(

@@ -204,17 +204,18 @@ def test_nonsense_labels(client: TestClient, board: Board, body: dict) -> None:
 # --- Operator and viewers.
 
 
-def test_viewers_look_and_stop_and_take_over(client: TestClient, board: Board) -> None:
+def test_viewers_look_and_pause_and_stop_and_take_over(client: TestClient, board: Board) -> None:
     assert client.get("/api/state", headers=ANN).json()["control"]["you"] == "operator"
     client.post("/api/event", headers=ANN, json={"event": "start"})
     assert client.get("/api/state", headers=BOB).json()["control"]["you"] == "viewer"
     for headers in (BOB, {"X-Token": TOKEN}):
-        answer = client.post("/api/event", headers=headers, json={"event": "pause"})
+        answer = client.post("/api/event", headers=headers, json={"event": "success"})
         assert (answer.status_code, answer.json()["error"].split(":")[0]) == (403, "Viewing only")
     assert client.post("/api/control", headers={"X-Token": TOKEN}).status_code == 422
     assert client.post("/api/control", headers=BOB, json={}).status_code == 200
-    assert client.post("/api/event", headers=ANN, json={"event": "pause"}).status_code == 403
-    assert client.post("/api/event", headers=BOB, json={"event": "pause"}).status_code == 200
+    assert client.post("/api/event", headers=ANN, json={"event": "pause"}).status_code == 200
+    assert client.post("/api/event", headers=ANN, json={"event": "resume"}).status_code == 403
+    assert client.post("/api/event", headers=BOB, json={"event": "resume"}).status_code == 200
     assert "taken over" in board.snapshot()["log"][-1]["text"]
     text = json.dumps(client.get("/api/state", headers=ANN).json())
     assert '"bob"' not in text  # by whose name others could act
@@ -263,8 +264,10 @@ def test_a_session_over_the_websocket(client: TestClient, board: Board) -> None:
         assert (refused["answer"], refused["ok"]) == (2, False)
         assert "no place while running" in refused["error"]
         with client.websocket_connect(f"{WS}/ws?token={TOKEN}&client=bob") as other:
-            other.send_json({"event": "pause", "id": 1})
+            other.send_json({"event": "success", "id": 1})
             assert "Viewing only" in answered(other)["error"]
+            other.send_json({"event": "pause", "id": 3})
+            assert answered(other)["state"] == "paused"
             other.send_json({"event": "stop", "id": 2})
             assert answered(other)["state"] == "stopped"
         while page.receive_json().get("snapshot", {}).get("session", {}).get("state") != "stopped":

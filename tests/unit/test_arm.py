@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from cqn_train.robot.arm import Arm
-from cqn_train.robot.guard import Guard, GuardSettings, HeldError, RobotFault
+from cqn_train.robot.guard import Guard, GuardSettings, HeldError
 from cqn_train.robot.limits import Limits
+from cqn_train.robot.readings import RobotFault
 from cqn_train.robot.settings import ArmSettings
 from lerobot_cqn.errors import ConfigError
 
@@ -28,7 +29,7 @@ class Gripped(Motors):
     """Two joints and a gripper, as the guard's motors; gives a value of the scene as well."""
 
     action_features = dict.fromkeys(NAMES, float)
-    observation_features = dict.fromkeys((*NAMES, "object.x.pos"), float) | {"eye": (4, 4, 3)}
+    observation_features = dict.fromkeys((*NAMES, "object.x.pos"), float) | {"eye": (4, 6, 3)}
 
     def get_observation(self) -> dict[str, Any]:
         self.noise += 1
@@ -133,6 +134,23 @@ def test_a_leader_that_fails_is_a_fault_and_spoils_nothing(broken: Callable[[Lea
     assert motors.goals == []
     arm.leader = None
     with pytest.raises(RobotFault, match="There is no leader arm"):
+        arm.follow()
+
+
+def test_one_wrong_reading_of_the_leader_does_not_lead_the_arm_astray() -> None:
+    leader = Leader()
+    arm, motors, _ = made(leader)
+    motors.joints = np.array([10.0, -20.0, 0.0])
+    arm.guard.read()
+    for wrong in range(2):
+        reads = iter(range(100))
+        leader.on_read = lambda wrong=wrong, reads=reads: leader.joints.fill(360.0 * (next(reads) == wrong))  # type: ignore[misc]
+        assert arm.follow()[:2] == pytest.approx([10.0, -20.0])
+        assert arm.follow()[:2] == pytest.approx([10.0, -20.0])
+        arm.let_go()
+    reads = iter(range(100))
+    leader.on_read = lambda: leader.joints.fill(50.0 * next(reads))
+    with pytest.raises(RobotFault, match="leader's readings do not agree"):
         arm.follow()
 
 

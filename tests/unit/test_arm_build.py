@@ -54,7 +54,9 @@ def agent(root: Path, action: dict[str, Any], *, deltas: bool, state: Any = STAT
 
 
 def test_limits_of_joint_differences(tmp_path: Path) -> None:
-    made = limits_of(robot(), agent(tmp_path, DELTAS, deltas=True), ArmSettings(joint_margin=0.1, step_factor=1.5), FPS)
+    made = limits_of(
+        robot(), agent(tmp_path, DELTAS, deltas=True), ArmSettings(joint_margin=0.1, step_factor=1.5), FPS, FPS
+    )
     # Seen joints and the goals from them, with a tenth of that range on each side.
     assert made.low == pytest.approx([-94 - 18.6, -1 - 4.4, -10, 20])
     assert made.high == pytest.approx([92 + 18.6, 43 + 4.4, 110, 20])
@@ -63,8 +65,21 @@ def test_limits_of_joint_differences(tmp_path: Path) -> None:
     assert 0 < made.max_step[3] < 1e-6  # a joint that never moved stays
 
 
+@pytest.mark.parametrize("deltas", [True, False])
+def test_a_higher_rate_than_the_demonstrations_shortens_the_steps(tmp_path: Path, deltas: bool) -> None:
+    known = agent(tmp_path, DELTAS if deltas else GOALS, deltas=deltas)
+    usual = limits_of(robot(), known, ArmSettings(), FPS, FPS)
+    faster, slower = (limits_of(robot(), known, ArmSettings(), fps, FPS) for fps in (4 * FPS, FPS // 2))
+    assert faster.max_step[:2] == pytest.approx(usual.max_step[:2] / 4)
+    assert faster.max_speed[:2] == pytest.approx(usual.max_speed[:2])
+    assert slower.max_step == pytest.approx(usual.max_step)  # and half the speed
+    assert slower.max_speed == pytest.approx(usual.max_speed / 2)
+
+
 def test_limits_of_absolute_goals(tmp_path: Path) -> None:
-    made = limits_of(robot(), agent(tmp_path, GOALS, deltas=False), ArmSettings(joint_margin=0, step_factor=2), FPS)
+    made = limits_of(
+        robot(), agent(tmp_path, GOALS, deltas=False), ArmSettings(joint_margin=0, step_factor=2), FPS, FPS
+    )
     assert made.low[:3] == pytest.approx([-100, 0, 0])
     assert made.high[:3] == pytest.approx([90, 45, 100])
     assert made.max_step[:2] == pytest.approx([0.1 * 190, 0.1 * 45])  # a twentieth of the range, twice
@@ -73,7 +88,7 @@ def test_limits_of_absolute_goals(tmp_path: Path) -> None:
 
 def test_what_is_given_replaces_what_was_seen(tmp_path: Path) -> None:
     settings = ArmSettings(joint_limits={"lift.pos": [-7.0, 8.0]}, joint_margin=0)
-    made = limits_of(robot(), agent(tmp_path, DELTAS, deltas=True), settings, FPS)
+    made = limits_of(robot(), agent(tmp_path, DELTAS, deltas=True), settings, FPS, FPS)
     assert (made.low[1], made.high[1]) == (-7, 8)
     assert (made.low[0], made.high[0]) == (-94, 92)
 
@@ -82,29 +97,29 @@ def test_joints_nobody_knows_are_named(tmp_path: Path) -> None:
     known = agent(tmp_path, DELTAS, deltas=True)
     for settings in (ArmSettings(joint_limits={"lft.pos": [0, 1]}), ArmSettings(home={"lft.pos": 1})):
         with pytest.raises(ConfigError, match=r"Unknown joint 'lft\.pos'.*Did you mean 'lift\.pos'"):
-            limits_of(robot(), known, settings, FPS)
+            limits_of(robot(), known, settings, FPS, FPS)
     blind = agent(
         tmp_path, DELTAS, deltas=True, state=None,
         inputs={"observation.images.wrist": PolicyFeature(FeatureType.VISUAL, (3, 84, 84))},
     )  # fmt: skip
     with pytest.raises(ConfigError, match=r"No range of 'pan\.pos'.*give --arm\.joint_limits"):
-        limits_of(robot(), blind, ArmSettings(), FPS)
+        limits_of(robot(), blind, ArmSettings(), FPS, FPS)
 
 
 def test_a_workspace_needs_kinematics(tmp_path: Path) -> None:
     known = agent(tmp_path, DELTAS, deltas=True)
     settings = ArmSettings(workspace=[0, 1, -1, 1, 0.1, 0.9])
     with pytest.raises(ConfigError, match=r"give --arm\.urdf=FILE"):
-        limits_of(robot(), known, settings, FPS)
+        limits_of(robot(), known, settings, FPS, FPS)
     own = robot(tip_position=lambda joints: [joints["pan.pos"], 0.0, joints["wrist.pos"]])
-    made = limits_of(own, known, settings, FPS)
+    made = limits_of(own, known, settings, FPS, FPS)
     assert made.box is not None
     assert made.forward is not None
     assert (made.box[0].tolist(), made.box[1].tolist()) == ([0, -1, 0.1], [1, 1, 0.9])
     assert made.forward(np.array([0.3, 0.0, 0.0, 0.7])).tolist() == [0.3, 0.0, 0.7]
     lost = ArmSettings(workspace=[0, 1, -1, 1, 0.1, 0.9], urdf=str(tmp_path / "none.urdf"))
     with pytest.raises(ConfigError, match=r"--arm\.urdf=.*none\.urdf cannot be used"):
-        limits_of(robot(), known, lost, FPS)
+        limits_of(robot(), known, lost, FPS, FPS)
 
 
 # -- home ------------------------------------------------------------------------------------------------------------

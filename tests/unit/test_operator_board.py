@@ -274,12 +274,12 @@ def running(control: Control) -> Session:
     return control._session
 
 
-def test_the_first_is_the_operator_and_others_only_stop(control: Control) -> None:
+def test_the_first_is_the_operator_and_others_only_pause_and_stop(control: Control) -> None:
     session = running(control)
     with pytest.raises(ViewingOnlyError, match="Take control"):
-        control.apply("bob", Event.PAUSE)
+        control.apply("bob", Event.SUCCESS)
     with pytest.raises(ViewingOnlyError):
-        control.apply(None, Event.PAUSE)
+        control.apply(None, Event.SUCCESS)
     with pytest.raises(ViewingOnlyError):
         control.correct("bob", 0, Label.FAILURE)
     assert session.state is State.RUNNING
@@ -291,6 +291,16 @@ def test_the_first_is_the_operator_and_others_only_stop(control: Control) -> Non
         control.apply("ann", Event.RESUME)
     control.apply("ann", Event.STOP)
     assert session.state is State.STOPPED
+
+
+@pytest.mark.parametrize("client", [None, "ann", "bob"])
+def test_everybody_may_pause_and_only_the_operator_goes_on(control: Control, client: str | None) -> None:
+    session = running(control)
+    assert control.apply(client, Event.PAUSE) is State.PAUSED
+    if client != "ann":
+        with pytest.raises(ViewingOnlyError):
+            control.apply(client, Event.RESUME)
+    assert session.state is State.PAUSED
 
 
 @pytest.mark.parametrize("client", [None, "ann", "bob"])

@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cqn_train.robot.guard import Guard, GuardSettings, RobotFault, StoppedError
+from cqn_train.robot.guard import Guard, GuardSettings, StoppedError
 from cqn_train.robot.limits import Limits, allowed_goal
+from cqn_train.robot.readings import RobotFault
 from lerobot_cqn.errors import ConfigError
 
 from ..driven_clock import DrivenClock, until
@@ -97,6 +98,7 @@ class Motors:
         self.bus: Any = None
 
     action_features = dict.fromkeys(NAMES, float)
+    observation_features = dict.fromkeys(NAMES, float) | {"eye": (4, 4, 3)}
 
     def connect(self) -> None:
         self.is_connected = True
@@ -130,7 +132,7 @@ def guarded(settings: GuardSettings | None = None) -> tuple[Guard, Motors, Drive
 @given(st.lists(st.tuples(vectors, st.floats(0.001, 2.0)), min_size=1, max_size=30))
 def test_no_sequence_of_goals_breaks_a_limit(goals: list[tuple[Any, float]]) -> None:
     guard, motors, clock = guarded()
-    before, sent_at = motors.joints.copy(), clock.now
+    before, sent_at = motors.joints.copy(), 0.0
     for wanted, seconds in goals:
         clock.now += seconds
         guard.read()
@@ -204,7 +206,7 @@ def test_drivers_errors_become_one_kind(error: Exception) -> None:
 
 
 def test_readings_that_cannot_be_true() -> None:
-    guard, motors, clock = guarded(GuardSettings(stale_s=1.0, slow_s=0.5))
+    guard, motors, clock = guarded(GuardSettings(stale_s=1.0, current_s=0.5))
     motors.on_read = lambda observation: observation.update({"b.pos": float("nan")})
     with pytest.raises(RobotFault, match=r"'b\.pos' reads nan"):
         guard.read()

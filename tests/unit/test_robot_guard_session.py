@@ -5,7 +5,8 @@ import threading
 import numpy as np
 import pytest
 
-from cqn_train.robot.guard import Guard, GuardSettings, HeldError, RobotFault, StoppedError
+from cqn_train.robot.guard import Guard, GuardSettings, HeldError, StoppedError
+from cqn_train.robot.readings import RobotFault
 
 from ..driven_clock import DrivenClock
 from .test_robot_guard import D, Motors, failing, guarded, limits
@@ -98,14 +99,14 @@ def test_an_arm_that_was_moved_by_hand_is_held_where_it_is_now() -> None:
         guard.send(np.ones(D))
     guard.hold()
     assert len(motors.goals) == sent  # nothing goes to motors that are off
-    motors.joints = np.array([40.0, -30.0, 120.0])  # by hand, one of them beyond its limit
+    motors.joints = np.array([40.0, -30.0, 93.0])  # by hand, one of them a little beyond its limit
     clock.now = 5.0
     guard.engage()
     assert (guard.released, bus.on) == (False, True)
     assert bus.leaps == [0.0]
     clock.now += 0.1
     guard.send(np.zeros(D))
-    assert motors.goals[-1] == pytest.approx([35.0, -25.0, 115.0])  # from there, at the speed and step allowed
+    assert motors.goals[-1] == pytest.approx([35.0, -25.0, 88.0])  # from there, at the speed and step allowed
     guard.engage()
     assert len(bus.leaps) == 1  # only after a release
 

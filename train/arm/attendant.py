@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from ..clock import REAL, Clock
 from ..operator.session import IN_MOTION, Event, RefusedError, Session, State
 from ..robot.arm import Arm
-from ..robot.guard import HeldError, RobotFault, StoppedError
+from ..robot.guard import HeldError, StoppedError
+from ..robot.readings import RobotFault
 
 __all__ = ["Attendant"]
 
@@ -33,8 +34,11 @@ class Attendant:
         session: Session,
         show: Callable[[Mapping[str, NDArray[np.uint8]]], Any],
         clock: Clock = REAL,
+        should_stop: Callable[[], bool] = lambda: False,
     ) -> None:
+        """Nothing runs yet. should_stop: whether the process is to end, which stops the session as a person would."""
         self.arm, self.session, self._show, self._clock = arm, session, show, clock
+        self._should_stop = should_stop
         self.changed = threading.Event()
         self._wake = threading.Event()
         self._closing = threading.Event()
@@ -84,6 +88,8 @@ class Attendant:
 
     def turn(self) -> None:
         """One look at the session, and what it asks for; raises nothing."""
+        if self._should_stop() and self.session.state is not State.STOPPED:
+            self.session.apply(Event.STOP)  # also while the loop evaluates, learns or saves
         state = self.session.state
         try:
             self._attend(state, self._before)
@@ -119,14 +125,18 @@ class Attendant:
         """Steps towards home at the control rate, until it is there or something else comes up."""
         self.session.note_homing(True)
         try:
-            while self._homeward and not self._closing.is_set() and not self.session.free:
+            while self._homeward and self._may_go_home() and not self._closing.is_set():
                 self._show(self.arm.guard.read().pictures)
-                self._homeward = not self.arm.step_home(lambda: self.session.state in BETWEEN)
+                self._homeward = not self.arm.step_home(self._may_go_home)
                 self._clock.sleep(1 / self.arm.fps)
             self._homeward = False
             self.arm.guard.hold()
         finally:
             self.session.note_homing(False)
+
+    def _may_go_home(self) -> bool:
+        session = self.session
+        return session.state in BETWEEN and session.homing and not session.free and not self._should_stop()
 
     def _recover(self) -> None:
         try:

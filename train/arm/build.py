@@ -38,6 +38,7 @@ __all__ = ["Operated", "make_operated", "recall", "steering"]
 Array = NDArray[np.float64]
 # Of a joint's range: the largest step where actions are goals, so that none says how far is usual.
 ABSOLUTE_SHARE = 0.05
+CURRENT_S = 0.3  # that a reading may be old, and no less than two control steps
 
 
 @dataclass(frozen=True)
@@ -70,11 +71,12 @@ def make_operated(
     fps = config.arm.fps or (int(demonstrations.meta.fps) if demonstrations is not None else None)
     if fps is None:
         raise ConfigError("How many control steps a second? Give --arm.fps (that of the demonstrations).")
-    limits = limits_of(robot, agent, config.arm, fps)
+    seen_fps = demonstrations.meta.fps if demonstrations is not None else fps
+    limits = limits_of(robot, agent, config.arm, fps, seen_fps)
     home = home_of(demonstrations, robot, config.arm) if demonstrations is not None or config.arm.home else None
     names = tuple(robot.action_features)
     _check_home(home, names, limits)
-    settings = GuardSettings(config.arm.stale_s, config.arm.watchdog_s)
+    settings = GuardSettings(config.arm.stale_s, config.arm.watchdog_s, current_s=max(CURRENT_S, 2 / fps))
     clutched = [i for i, name in enumerate(names) if "gripper" not in name]
     arm = Arm(Guard(robot, limits, settings, clock), config.arm, fps, leader=leader, clutched=clutched, home=home)
     if agent.deltas is None:
@@ -141,8 +143,11 @@ def check_robot_fits(robot: Robot, agent: Agent) -> None:
         )
 
 
-def limits_of(robot: Robot, agent: Agent, settings: ArmSettings, fps: int) -> Limits:
+def limits_of(robot: Robot, agent: Agent, settings: ArmSettings, fps: int, seen_fps: float) -> Limits:
     """Limits from what the demonstrations did: their joints with a margin, their largest step with a factor.
+
+    fps: control steps a second; at a higher rate than `seen_fps`, that of the demonstrations, steps are shorter: the
+        speed limit stays.
 
     Raises ConfigError for joints that are not the robot's, or where neither data nor settings say a limit.
     """
@@ -172,6 +177,7 @@ def limits_of(robot: Robot, agent: Agent, settings: ArmSettings, fps: int) -> Li
             step[i] = (high[i] - low[i]) * (1.0 if gripper else settings.step_factor * ABSOLUTE_SHARE)
         margin = settings.joint_margin * (high[i] - low[i])
         low[i], high[i] = settings.joint_limits.get(name, (low[i] - margin, high[i] + margin))
+    step *= min(1.0, seen_fps / fps)
     step = np.maximum(step, 1e-3 * np.maximum(high - low, 1e-6))  # a joint that never moved
     box = None
     if settings.workspace is not None:

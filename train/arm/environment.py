@@ -12,8 +12,9 @@ from ..clock import REAL, Clock
 from ..interfaces import Frame, Interrupted, Label, Outcome
 from ..operator.session import IN_MOTION, Event, RefusedError, Session, State
 from ..robot.arm import Arm
-from ..robot.guard import HeldError, Reading, RobotFault, StoppedError
+from ..robot.guard import HeldError, StoppedError
 from ..robot.pace import Pace
+from ..robot.readings import Reading, RobotFault
 from .attendant import Attendant
 
 __all__ = ["ArmEnvironment", "Display"]
@@ -61,7 +62,7 @@ class ArmEnvironment:
     ) -> None:
         self.arm, self.session, self.display, self._clock = arm, session, display, clock
         self._should_stop = should_stop
-        self._attendant = Attendant(arm, session, display.show, clock)
+        self._attendant = Attendant(arm, session, display.show, clock, should_stop)
         self._pace = Pace(arm.fps, clock)
         self._steps, self._began = 0, 0.0
         self._frame: Frame = {}

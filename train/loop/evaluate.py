@@ -90,24 +90,24 @@ def evaluate(
     episodes: int,
     *,
     seed: int = EVAL_SEED,
-    on_episode: Callable[[int], None] = lambda _: None,
+    on_step: Callable[[], None] = lambda: None,
     film: int = 0,
 ) -> Evaluation:
     """Run `episodes` episodes without noise, as lerobot-eval does, as many at a time as there are scenes.
 
-    film: episodes to take pictures of. Episode i has seed + i, however many run at a time.
+    on_step: called before each control step; what it raises ends the evaluation. film: episodes to take pictures of.
+    Episode i has seed + i, however many run at a time.
     """
     total = Evaluation()
     for first in range(0, episodes, scenes.count):
-        wave = _wave(agent, scenes, seed + first, max(0, film - first))
+        wave = _wave(agent, scenes, seed + first, max(0, film - first), on_step)
         count = min(scenes.count, episodes - first)
         for field_ in fields(Evaluation):
             getattr(total, field_.name).extend(getattr(wave, field_.name)[:count])
-        on_episode(first + count)
     return total
 
 
-def _wave(agent: Agent, scenes: Scenes, seed: int, film: int) -> Evaluation:
+def _wave(agent: Agent, scenes: Scenes, seed: int, film: int, on_step: Callable[[], None]) -> Evaluation:
     """One episode in each scene, with pictures of the first `film`."""
     agent.reset()
     count = scenes.count
@@ -124,6 +124,7 @@ def _wave(agent: Agent, scenes: Scenes, seed: int, film: int) -> Evaluation:
                 shown.append(pictures[k])
 
     while running.any() and length.max() < scenes.max_steps:
+        on_step()
         look()
         prepared = agent.prepare(frame)
         state = agent.low_dim(prepared)

@@ -255,13 +255,13 @@ class Trainer:
         if not episodes:
             return
 
-        def look(_: int) -> None:
+        def look() -> None:
             if self.should_stop():
                 raise Interrupted
 
         self.person.expect(None)
         films = self.config.eval.videos
-        result = evaluate(self.agent, self.scenes, episodes, on_episode=look, film=films)
+        result = evaluate(self.agent, self.scenes, episodes, on_step=look, film=films)
         if films:
             stem = f"{phase}_{self.counters.env_steps:06d}"
             write_films(result.frames, result.outcomes, self.metrics.output_dir / "videos", stem, self.env.fps)

@@ -76,7 +76,7 @@ class Control:
             self._said(f"Control was taken over by the page {client[:4]}.")
 
     def apply(self, client: str | None, event: Event) -> State:
-        """Apply what a person asks for. `stop` is everybody's; the rest is the operator's alone.
+        """Apply what a person asks for. `stop` and `pause` are everybody's; the rest is the operator's alone.
 
         Raises ViewingOnlyError for others, RefusedError where the event has no place now or is not a person's.
         """
@@ -84,7 +84,7 @@ class Control:
             raise RefusedError(f"'{event}' happens by itself: nobody can ask for it.")
         if client is not None:
             self.seen(client)
-        if event is not Event.STOP:
+        if event not in (Event.STOP, Event.PAUSE):
             self._only_operator(client)
         return self._session.apply(event)
 

@@ -91,7 +91,8 @@ class TerminalKeys:
         if events is None:
             return
         allowed = self._session.allowed()
-        event = next((event for event in events if event in allowed), events[0])
+        urgent = sorted(events, key=lambda event: event is not Event.PAUSE)  # an arm on its way home could start, too
+        event = next((event for event in urgent if event in allowed), events[0])
         if held and event in _MOVES:  # a key that is held may stop the arm, never move it
             return
         try:

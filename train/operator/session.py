@@ -2,7 +2,8 @@
 
 An episode runs from `start` to `success`, `failure` or `discard`, by a person's hand; in between it may be paused, or
 driven by the person (`take_over`). When its time is up it waits for its label. Then the person resets the scene, and
-the next one may start; meanwhile the arm goes home when asked to, or lets itself be moved by hand (`free`). A fault
+the next one may start; meanwhile the arm goes home when asked to, until it is there or paused on its way, or lets
+itself be moved by hand (`free`). A fault
 leads to FAULTED from everywhere, `stop` to STOPPED, which nothing leaves.
 """
 
@@ -63,7 +64,10 @@ IN_EPISODE = IN_MOTION | {State.PAUSED, State.LABELLING}
 _ENDS = dict.fromkeys(LABELS, State.RESETTING)
 _ALWAYS = {Event.STOP: State.STOPPED, Event.FAULT: State.FAULTED}
 TRANSITIONS: Mapping[State, Mapping[Event, State]] = {
-    State.WAITING: {**_ALWAYS, Event.START: State.RUNNING, Event.HOME: State.WAITING, Event.FREE: State.WAITING},
+    State.WAITING: {
+        **_ALWAYS, Event.START: State.RUNNING, Event.HOME: State.WAITING, Event.FREE: State.WAITING,
+        Event.PAUSE: State.WAITING,
+    },
     State.RUNNING: {
         **_ALWAYS, **_ENDS, Event.PAUSE: State.PAUSED, Event.ABSENT: State.PAUSED,
         Event.TAKE_OVER: State.TEACHING, Event.TIME_UP: State.LABELLING,
@@ -76,6 +80,7 @@ TRANSITIONS: Mapping[State, Mapping[Event, State]] = {
     State.LABELLING: {**_ALWAYS, **_ENDS},
     State.RESETTING: {
         **_ALWAYS, Event.READY: State.WAITING, Event.HOME: State.RESETTING, Event.FREE: State.RESETTING,
+        Event.PAUSE: State.RESETTING,
     },
     # What was going on is over; where an episode was, a person says how it went (see `Session.apply`).
     State.FAULTED: {Event.STOP: State.STOPPED, Event.FAULT: State.FAULTED, Event.RECOVERED: State.RESETTING},
@@ -142,6 +147,7 @@ class Session:
                 self._count()
             self.free = not self.free if event is Event.FREE else self.free and event is Event.READY
             self._home = event is Event.HOME or (self._home and event is Event.READY)
+            self.homing = self.homing and event in (Event.READY, Event.HOME)
             if event in LABELS:
                 self.labels[self.episode] = LABELS[event]
                 self._unlabelled, self.busy = False, "storing the episode"
@@ -223,6 +229,8 @@ class Session:
         """Reason, for people, against an event that the state allows; "" where there is none."""
         if event is Event.START and self.busy:
             return f"An episode cannot start while the learner is busy ({self.busy}): wait for it."
+        if event is Event.PAUSE and self.state in (State.WAITING, State.RESETTING) and not self.homing:
+            return f"'{event}' has no place while {self.state}: nothing moves."
         if event is Event.TAKE_OVER and self.evaluating:
             return "An evaluation is on: the policy must do it alone; discard it, or wait."
         if event is Event.TAKE_OVER and not self.leader:

@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 from lerobot_cqn.errors import ConfigError
 
 from ..interfaces import Frame
-from .guard import Guard, Reading, RobotFault
+from .guard import Guard
 from .limits import Limits
+from .readings import Reading, RobotFault
 from .settings import ArmSettings
 
 __all__ = ["Arm", "state_names"]
 
 Array = NDArray[np.float64]
+TAKEN = 5  # tries for two readings of the leader that agree
 AT_HOME = 0.1  # share of the largest step within which the arm counts as being at home
 
 
@@ -109,18 +111,30 @@ class Arm:
         """Goal [D] that the person at the leader asks for. Raises RobotFault when the leader cannot be read."""
         if self.leader is None:
             raise RobotFault("There is no leader arm.")
+        wanted = self._led(self.leader)
+        if self._offset is None:
+            # What it says when it is taken counts as long as it is held: one wrong reading would lead the arm astray.
+            for _ in range(TAKEN):
+                before, wanted = wanted, self._led(self.leader)
+                if (np.abs(wanted - before)[self._clutched] <= self.limits.max_step[self._clutched]).all():
+                    break
+            else:
+                raise RobotFault("The leader's readings do not agree: keep it still while you take over.")
+            self._offset = np.zeros(len(self.names))
+            self._offset[self._clutched] = (self.guard.joints - wanted)[self._clutched]
+        return wanted + self._offset
+
+    def _led(self, leader: Teleoperator) -> Array:
+        """The leader's joints [D]."""
         try:
-            action = self.leader.get_action()
+            action = leader.get_action()
             wanted = np.array([float(action[name]) for name in self.names])
         except Exception as error:  # drivers raise many kinds
             raise RobotFault(f"The leader cannot be read: {error} Check its cable and power.") from error
         if not np.isfinite(wanted).all():
             bad = self.names[int(np.flatnonzero(~np.isfinite(wanted))[0])]
             raise RobotFault(f"The leader's joint '{bad}' reads {action[bad]}: expected a finite number.")
-        if self._offset is None:
-            self._offset = np.zeros(len(self.names))
-            self._offset[self._clutched] = (self.guard.joints - wanted)[self._clutched]
-        return wanted + self._offset
+        return wanted
 
     def let_go(self) -> None:
         """The person does not drive; a leader with motors is led along, so that it is where the arm is when taken."""

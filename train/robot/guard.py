@@ -14,17 +14,15 @@ from lerobot_cqn.errors import CQNError
 
 from ..clock import REAL, Clock
 from .limits import Limits, allowed_goal
+from .readings import Agreement, Contents, Reading, RobotFault, Whereabouts, WrongReadingError
 
-__all__ = ["Guard", "GuardSettings", "Reading", "RobotFault", "StoppedError"]
+__all__ = ["Guard", "GuardSettings", "HeldError", "StoppedError"]
 
 Array = NDArray[np.float64]
-
-
-class RobotFault(CQNError, RuntimeError):  # noqa: N818  # what people call it
-    """The robot cannot be read or moved, or what it says cannot be true; the arm is held where that is possible."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__(" ".join(text.split()))  # drivers' errors have many lines
+WRONG = 3  # readings in a row that cannot be true: a fault; fewer are read again
+AGAIN_S = 0.005  # between them: the same answer of a bus is not read twice
+ASKED = 12  # readings until enough agree, where nothing is known yet
+APART_S = 0.05  # between them: a glitch is shorter
 
 
 class StoppedError(CQNError, RuntimeError):
@@ -41,29 +39,19 @@ class GuardSettings:
 
     stale_s: how long a camera's picture, or the joints while they are told to move, may stay exactly the same.
     watchdog_s: after how long without a goal the arm is held where it is.
-    slow_s: how long a reading or sending may take.
+    current_s: how long a reading may take, and how old it may be when a goal is sent that rests on it.
     """
 
     stale_s: float = 1.0
     watchdog_s: float = 0.5
-    slow_s: float = 1.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reading:
-    """One observation: joints [D] in the robot's units, pictures by name, everything the robot gave, and when."""
-
-    joints: Array
-    pictures: Mapping[str, NDArray[np.uint8]]
-    raw: Mapping[str, Any]
-    at: float
+    current_s: float = 0.3
 
 
 class Guard:
     """A robot behind limits, staleness checks, a watchdog and a stop that always wins. Use as a context manager.
 
     Attributes:
-        interventions: how often each limit changed a goal, by its name.
+        interventions: how often each limit changed a goal, by its name, and how many readings were refused.
         names: joints, in the order of arrays [D].
     """
 
@@ -78,6 +66,8 @@ class Guard:
         self._stopped = threading.Event()
         self._closing = threading.Event()
         self._goal: Array | None = None
+        self._contents = Contents(robot)
+        self._whereabouts = Whereabouts(self.names, limits)
         self._measured: Array | None = None
         self._trusted = True  # whether the joints that were read last can be believed
         self._sent_at = self._asked_at = self._read_at = clock.now
@@ -96,7 +86,10 @@ class Guard:
         self.close()
 
     def open(self) -> None:
-        """Connect, read once, start the watchdog. Raises RobotFault when the robot does not answer."""
+        """Connect, read, start the watchdog.
+
+        Raises RobotFault when the robot does not answer, or stands far outside the range of its limits.
+        """
         try:
             if not self.robot.is_connected:
                 self.robot.connect()
@@ -104,7 +97,7 @@ class Guard:
             raise
         except Exception as error:  # drivers raise many kinds
             raise RobotFault(f"The robot cannot be connected: {error} Check cables, power and --robot.port.") from error
-        self.read()
+        self._whereabouts.check_start(self.read().joints)
         self._watchdog = self._clock.thread(self._run, "watchdog")
         self._watchdog.start()
 
@@ -124,29 +117,75 @@ class Guard:
     # -- reading ---------------------------------------------------------------------------------------------
 
     def read(self) -> Reading:
-        """Joints and pictures. Raises RobotFault when it fails, takes too long, or is not finite, or stale."""
+        """Joints and pictures that can be true: one reading is read again, WRONG in a row are a fault.
+
+        While the arm is moved by hand its joints may be anywhere. The first reading is one of several that agree.
+        Raises RobotFault when it fails, takes too long, cannot be true, or is stale.
+        """
         with self._lock:
-            begun = self._clock.now
-            try:
-                raw = self.robot.get_observation()
-                joints = np.array([float(raw[name]) for name in self.names])
-            except Exception as error:  # drivers raise many kinds, or leave a joint out
-                raise RobotFault(f"The robot cannot be read: {error} Check cables and power.") from error
-            now = self._clock.now
-            if now - begun > self.settings.slow_s:
-                raise RobotFault(
-                    f"Reading the robot took {now - begun:.1f} s, expected at most {self.settings.slow_s:g} s."
-                )
+            if self._measured is None:
+                return self._settle()
             self._trusted = False
-            if not np.isfinite(joints).all():
-                bad = self.names[int(np.flatnonzero(~np.isfinite(joints))[0])]
-                raise RobotFault(f"The joint '{bad}' reads {raw[bad]}: expected a finite number; check its sensor.")
-            pictures = {name: value for name, value in raw.items() if isinstance(value, np.ndarray) and value.ndim == 3}
-            self._check_fresh(joints, pictures, now)
-            self._measured, self._trusted, self._read_at = joints, True, now
-            if self._goal is None:
-                self._goal = joints
-        return Reading(joints=joints, pictures=pictures, raw=raw, at=now)
+            for left in reversed(range(WRONG)):
+                try:
+                    reading = self._look()
+                    if not self._released:
+                        self._whereabouts.check(reading.joints)
+                    break
+                except WrongReadingError:
+                    self._count("wrong reading")
+                    if not left:
+                        raise
+                    self._clock.sleep(AGAIN_S)
+            self._believe(reading)
+            return reading
+
+    def _settle(self) -> Reading:
+        """A reading that several in a row agree with: where the arm is, when nothing is known of it."""
+        self._trusted = False
+        agreement = Agreement(self.names, self._whereabouts.slack / 2)
+        for asked in range(ASKED):
+            if asked:
+                self._clock.sleep(APART_S)
+            try:
+                settled = agreement.add(self._look())
+            except WrongReadingError:
+                self._count("wrong reading")
+                if asked == ASKED - 1:
+                    raise
+                continue
+            if settled is not None:
+                if self._measured is None:
+                    self._whereabouts.begin(settled.joints)
+                self._believe(settled)
+                return settled
+        raise RobotFault(
+            f"The robot's readings do not agree: {agreement.doubt}. Keep the arm still; check its sensors and cables."
+        )
+
+    def _look(self) -> Reading:
+        """One reading as the driver gives it, complete and current."""
+        begun = self._clock.now
+        try:
+            raw = self.robot.get_observation()
+        except Exception as error:  # drivers raise many kinds
+            raise RobotFault(f"The robot cannot be read: {error} Check cables and power.") from error
+        took = self._clock.now - begun
+        if took > self.settings.current_s:
+            raise RobotFault(f"Reading the robot took {took:.1f} s, expected at most {self.settings.current_s:g} s.")
+        reading = self._contents.take(raw, begun)
+        self._check_fresh(reading.joints, reading.pictures, begun + took)
+        return reading
+
+    def _believe(self, reading: Reading) -> None:
+        joints = reading.joints
+        if self._goal is None:
+            self._goal = joints
+        self._whereabouts.believe(joints, self._goal)
+        self._measured, self._trusted, self._read_at = joints, True, reading.at
+
+    def _count(self, what: str) -> None:
+        self.interventions[what] = self.interventions.get(what, 0) + 1
 
     def _check_fresh(self, joints: Array, pictures: Mapping[str, NDArray[np.uint8]], now: float) -> None:
         """Refusal of what does not change at all, and so was not measured: noise alone makes real readings differ."""
@@ -184,22 +223,27 @@ class Guard:
         the goal.
         """
         with self._lock:
-            if self._stopped.is_set():
-                raise StoppedError("The arm was stopped: start again to move it.")
-            if self._released or not may_move():
-                raise HeldError("The arm may not move now.")
-            now = self._clock.now
-            if self._measured is None or self._goal is None:
+            self._check_may_move(may_move)
+            if self._measured is None or self._clock.now - self._read_at > self.settings.current_s:
                 self.read()
+                self._check_may_move(may_move)  # reading takes time
             assert self._measured is not None and self._goal is not None  # noqa: S101, PT018  # read sets both
+            now, sure = self._clock.now, self._whereabouts.sure
             # After a break the arm must not catch up in one leap.
             seconds = min(now - self._sent_at, self.settings.watchdog_s)
-            verdict = allowed_goal(wanted, self._measured, self._goal, seconds, self.limits)
+            places = np.stack([self._measured, self._measured if sure is None else sure])
+            verdict = allowed_goal(wanted, places, self._goal, seconds, self.limits)
             for reason in verdict.reasons:
-                self.interventions[reason] = self.interventions.get(reason, 0) + 1
+                self._count(reason)
             self._transmit(verdict.goal)
             self._asked_at, self._held = now, False
             return verdict.goal
+
+    def _check_may_move(self, may_move: Callable[[], bool]) -> None:
+        if self._stopped.is_set():
+            raise StoppedError("The arm was stopped: start again to move it.")
+        if self._released or not may_move():
+            raise HeldError("The arm may not move now.")
 
     def hold(self) -> None:
         """Stay where the arm is now. Raises RobotFault when the robot does not take it."""
@@ -228,11 +272,16 @@ class Guard:
             self._released = True
 
     def engage(self) -> None:
-        """Hold the arm where it is now, after `release`. Raises RobotFault when the robot does not do it."""
+        """Hold the arm where it is now, after `release`.
+
+        Raises RobotFault when the robot does not do it, its readings do not agree, or it was put beyond the limits.
+        """
         with self._lock:
             if self._released:
+                self._found()
+                assert self._goal is not None  # noqa: S101  # found sets it
                 # Before the motors hold again: they would leap to the goal that they were given last.
-                self._transmit(self.read().joints)
+                self._transmit(self._goal)
                 self._torque(on=True)
                 self._released = False
                 self._hold()
@@ -258,25 +307,42 @@ class Guard:
             raise RobotFault(f"The motors cannot be switched {'on' if on else 'off'}: {error}") from error
 
     def recover(self) -> None:
-        """After a fault: connect again where the connection is gone, read, hold. Raises RobotFault where it fails."""
+        """After a fault: connect again where the connection is gone, read until readings agree, hold.
+
+        Motors that were connected throughout still go to the goal that they have, so the arm is held there, a step
+        nearer to where it reads at most. Raises RobotFault where it fails, or the arm is beyond its limits.
+        """
         with self._lock:
+            connected = self.robot.is_connected
             try:
-                if not self.robot.is_connected:
+                if not connected:
                     self.robot.connect()
             except Exception as error:  # drivers raise many kinds
                 raise RobotFault(f"The robot cannot be connected: {error} Check cables and power.") from error
-            self.read()
-            self._goal = self._measured  # not where it was sent before: it may have been moved
+            self._found(anew=not connected)
             self._hold()
+
+    def _found(self, *, anew: bool = True) -> None:
+        """Settle where the arm is; anew: motors that were off have no goal of before, so theirs is here."""
+        joints = self._settle().joints
+        assert self._goal is not None  # noqa: S101  # settling sets it
+        self._trusted = False
+        self._whereabouts.check_inside(joints, self._goal)
+        self._goal = joints if anew else self._goal
+        self._whereabouts.begin(joints)
+        self._whereabouts.sent(self._goal)
+        self._trusted = True
 
     def _hold(self) -> None:
         # Where the arm says it is; where it was sent last when that is newer, or the reading cannot be believed.
-        place = self._measured if self._trusted and self._read_at >= self._sent_at else self._goal
+        place = self._whereabouts.sure if self._trusted and self._read_at >= self._sent_at else self._goal
         if place is not None and self._goal is not None and not self._released:
             self._held = True
             # An arm that is beyond a limit stays there: led back at once, it would leap.
             low, high = np.minimum(self.limits.low, self._goal), np.maximum(self.limits.high, self._goal)
-            self._transmit(np.clip(place, low, high))
+            # It can only be a step from its goal: what reads farther does not lead it there.
+            step = self.limits.max_step
+            self._transmit(np.clip(np.clip(place, low, high), self._goal - step, self._goal + step))
 
     def _transmit(self, goal: Array) -> None:
         try:
@@ -284,6 +350,7 @@ class Guard:
         except Exception as error:  # drivers raise many kinds
             raise RobotFault(f"The robot takes no goal: {error} Check cables and power.") from error
         self._goal, self._sent_at = goal, self._clock.now
+        self._whereabouts.sent(goal)
 
     def _run(self) -> None:
         while not self._clock.wait(self._closing, self.settings.watchdog_s / 5):
@@ -293,7 +360,7 @@ class Guard:
         """One look of the watchdog: hold the arm when nobody has sent a goal for too long, whatever the reason."""
         # Without the lock: a reading that hangs must not blind the watchdog, only delay its goal.
         if not self._held and self._clock.now - self._asked_at > self.settings.watchdog_s:
-            self.interventions["watchdog"] = self.interventions.get("watchdog", 0) + 1
+            self._count("watchdog")
             with self._lock, contextlib.suppress(RobotFault):
                 if not self._held:
                     self._hold()

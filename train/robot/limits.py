@@ -55,22 +55,26 @@ def allowed_goal(wanted: Array, measured: Array, last: Array, seconds: float, li
 
     Args:
         wanted: goal [D] that is asked for.
-        measured: joints [D] as read now.
+        measured: joints [D] as read now, or [N, D], all the places where they may be.
         last: goal [D] that was sent last.
         seconds: since the last goal was sent, > 0.
         limits: what to keep to.
 
     A goal that is not finite, or whose tip would leave the box, is replaced by the last one: the arm holds. Where the
-    last goal was beyond a joint limit, this one is not farther out.
+    last goal was beyond a joint limit, this one is not farther out. The speed limit comes last and holds whatever the
+    others say, above all whatever the joints read; a goal is never more than `max_step` from the last one.
     """
     if not np.isfinite(wanted).all():
         return Verdict(last, ("not finite",))
     reasons, goal = [], wanted.astype(np.float64)
+    places = np.atleast_2d(measured)
+    nearest = places.max(axis=0) - limits.max_step, places.min(axis=0) + limits.max_step
+    farthest = np.minimum(limits.max_speed * seconds, limits.max_step)
     steps = (
-        ("speed", last - limits.max_speed * seconds, last + limits.max_speed * seconds),
-        ("step", measured - limits.max_step, measured + limits.max_step),
-        # Last, so that it holds whatever the others say. An arm that was outside comes in at its speed, in no leap.
+        ("step", np.minimum(*nearest), np.maximum(*nearest)),
+        # An arm that was outside comes in at its speed, in no leap.
         ("joint limit", np.minimum(limits.low, last), np.maximum(limits.high, last)),
+        ("speed", last - farthest, last + farthest),
     )
     for name, low, high in steps:
         bounded = np.clip(goal, low, high)

@@ -1,5 +1,6 @@
 """Progress for a person: a live bar on a terminal, a line now and then in a log."""
 
+import contextlib
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -74,11 +75,12 @@ class ConsoleMonitor:
             self._logged = now
             left = (now - self._begun) / max(done - self._first, 1) * max(self._total - done, 0)
             part = f"{min(done, self._total)}/{self._total}"
-            self.console.print(f"{self._name:>8}  {part}  eta {left:.0f} s  {self._note}")
+            self.message(f"{self._name:>8}  {part}  eta {left:.0f} s  {self._note}")
 
     def message(self, text: str) -> None:
-        """A line that stays."""
-        self.console.print(text)
+        """A line that stays; where whoever read it is gone, the run goes on."""
+        with contextlib.suppress(OSError):
+            self.console.print(text)
 
 
 def last_line(log: Path, begin: str = "") -> str:

@@ -19,6 +19,7 @@ const NAMES = {
   take_over: "Take over", hand_back: "Hand back", home: "Home", free: "By hand", ready: "Ready", stop: "Stop run",
 };
 const KEYS = { " ": "Space", escape: "Esc" };
+const URGENT = ["stop", "pause"]; // everybody's, at any time
 const FACTS = {
   rate_hz: ["Control rate", "Hz", 1], jitter_ms: ["Jitter", "ms", 1], late: ["Late steps", "", 0],
   limited: ["Goals limited", "", 0], faults: ["Faults", "", 0], env_steps: ["Steps", "", 0], updates: ["Updates", "", 0],
@@ -118,13 +119,13 @@ function online() {
   if (document.body.classList.contains("denied")) return;
   const age = (performance.now() - shownAt) / 1000;
   const fine = Boolean(socket && socket.readyState === WebSocket.OPEN && shown && age < 3);
-  const over = shown && shown.session.state === "stopped";
+  const ended = over();
   document.body.classList.toggle("online", fine);
-  document.body.classList.toggle("offline", !fine && Boolean(shown) && !over);
-  $("connection-text").textContent = fine ? "Connected" : over ? "Closed" : "Not connected";
-  if (!fine && shown && !over) say($("state-name"), `Last known: ${(WORDS[shown.session.state] || [shown.session.state])[0]}`);
-  $("offline").hidden = fine || over || (!shown && performance.now() < 3000);
-  if (!fine && !over) {
+  document.body.classList.toggle("offline", !fine && Boolean(shown) && !ended);
+  $("connection-text").textContent = fine ? "Connected" : ended ? "Closed" : "Not connected";
+  if (!fine && shown && !ended) say($("state-name"), `Last known: ${(WORDS[shown.session.state] || [shown.session.state])[0]}`);
+  $("offline").hidden = fine || ended || (!shown && performance.now() < 3000);
+  if (!fine && !ended) {
     $("offline-title").textContent = "No connection.";
     $("offline-text").textContent = shown
       ? `What you see is ${Math.round(age)} s old. A moving arm pauses by itself while its operator is away. Trying again …`
@@ -145,7 +146,7 @@ function show(snapshot) {
   const name = session.evaluating && !["faulted", "stopped"].includes(session.state) ? `${word} · evaluation` : word;
   say($("state-name"), name);
   say($("state-hint"), session.state === "faulted" && session.fault ? `${session.fault} ${hint}`
-    : session.homing ? `The arm goes home: keep clear. ${hint}`
+    : session.homing ? `The arm goes home: keep clear. Pause (Space) holds it. ${hint}`
     : session.free ? "The arm can be moved by hand: hold it. By hand (M) again, or any other step, makes it hold itself."
     : session.state === "waiting" && session.busy ? "The learner is at work: the next episode can start when it is done." : hint);
   document.title = `${name} · operator`;
@@ -172,7 +173,7 @@ function viewing(control) {
   const viewer = control.you !== "operator";
   $("viewing").hidden = !viewer;
   say($("viewing-text"), !control.operator ? "Nobody has control."
-    : control.present ? "Another page has control. You can still stop the run." : "The page that has control is not there. You can still stop the run.");
+    : control.present ? "Another page has control. You can still pause and stop." : "The page that has control is not there. You can still pause and stop.");
   say($("who"), `${viewer ? "Viewing only" : "You have control"} · ${control.pages} ${control.pages === 1 ? "page" : "pages"} open`);
 }
 
@@ -247,15 +248,18 @@ function tick() {
 
 // --- What is pressed.
 
+function over() {
+  return Boolean(shown && shown.session.state === "stopped");
+}
+
 function controls(fine) {
   const allowed = (shown && shown.session.allowed) || [];
   const operator = shown && shown.control.you === "operator";
   for (const button of document.querySelectorAll("#controls button")) {
     const events = button.dataset.events.split(" ");
-    const event = events.find((name) => allowed.includes(name));
-    const mayPress = event && (event === "stop" || (fine && operator));
-    const over = shown && shown.session.state === "stopped";
-    button.disabled = !mayPress || over;
+    const event = [...events].sort((a, b) => (b === "pause") - (a === "pause")).find((name) => allowed.includes(name));
+    const mayPress = event && (URGENT.includes(event) || (fine && operator));
+    button.disabled = !mayPress || over();
     if (events[0] === "free") button.setAttribute("aria-pressed", String(Boolean(shown && shown.session.free)));
     button.dataset.event = event || "";
     say(button.firstElementChild, NAMES[event || events[0]]);
@@ -268,17 +272,17 @@ $("controls").addEventListener("click", ({ target }) => {
 });
 
 document.addEventListener("keydown", (press) => {
-  const typing = press.target.closest?.("input, textarea, select, [contenteditable]");
-  if (press.repeat || press.ctrlKey || press.altKey || press.metaKey || typing) {
-    if (press.repeat && press.key === " " && !typing) press.preventDefault();
-    return;
-  }
   const key = KEYS[press.key.toLowerCase()] || press.key.toUpperCase();
   const button = document.querySelector(`#controls button[data-key="${CSS.escape(key)}"]`);
   if (!button) return;
+  const event = key === "Esc" ? "stop" : button.dataset.event;
+  const typing = press.target.closest?.("input:not([type=range]), textarea, select, [contenteditable]");
+  // Stop and pause come through whatever has the focus, and whatever else is held down.
+  if (!URGENT.includes(event) && (press.ctrlKey || press.altKey || press.metaKey || typing)) return;
   press.preventDefault(); // Space would press whatever has the focus, too
-  if (!button.disabled) {
-    send(button.dataset.event);
+  if (press.repeat) return; // the key has done its work when it went down
+  if (!button.disabled || (event === "stop" && !over())) {
+    send(event);
     button.focus({ preventScroll: true });
   }
 });
