@@ -46,6 +46,7 @@ class RLPolicy(PreTrainedPolicy):
         super().__init__(config)
         if dataset_meta is not None and config.push_to_hub:  # at the end of a training that begins now
             refuse_to_start()
+        _leave_out_depth(config, dataset_meta)
         config.validate_features()
         shapes = {key: feature.shape for key, feature in sorted(config.image_features.items())}
         self.view_keys = tuple(shapes)
@@ -243,3 +244,11 @@ class RLPolicy(PreTrainedPolicy):
 
         push = super().push_model_to_hub
         retried(lambda: push(cfg, *args, **kwargs), PUSH_WAITS, explained, logger.warning)
+
+
+def _leave_out_depth(config: RLConfig, meta: Any) -> None:
+    """Take the depth cameras of the dataset `meta` out of what a policy sees: distances are not scaled like colours."""
+    seen = [key for key in getattr(meta, "depth_keys", ()) if key in (config.input_features or {})]
+    if seen:
+        config.input_features = {k: f for k, f in (config.input_features or {}).items() if k not in seen}
+        logger.warning("Depth is not looked at: %s is left out; the policy sees the other cameras.", ", ".join(seen))

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
     from ..disk.source import Source
     from .cameras import CameraLook
-    from .checks import Dataset, Finding
+    from .checks import Dataset
+    from .finding import Finding
     from .numbers import Numbers
 
 __all__ = ["InspectConfig", "Inspection", "help", "inspect_dataset", "main"]
@@ -92,7 +93,7 @@ def main(args: list[str]) -> int:
     config = parse(InspectConfig, args)
     load_lerobot()
     from ..disk.source import open_source
-    from .checks import Finding
+    from .finding import Finding
 
     page = config.page  # once: after it is written, the next free name is another one
     if page is not None:
@@ -224,7 +225,8 @@ def _print_json(config: InspectConfig, inspection: Inspection) -> None:
 
 def as_json(repo_id: str, inspection: Inspection) -> dict[str, Any]:
     """Plain types; the shape is the same whatever was found, with None for what could not be measured."""
-    from .checks import LEVELS, memory
+    from .checks import memory
+    from .finding import LEVELS
 
     dataset, numbers, cameras = inspection.dataset, inspection.numbers, inspection.cameras
     report: dict[str, Any] = {
