@@ -154,7 +154,7 @@ class RLPolicy(PreTrainedPolicy):
         now = [deltas.index(index) for index in range(1 - s.frame_stack, 1)]
         frames = {key: self._with_time(batch, key) for key in (*self.view_keys, *self.low_dim_keys)}
         observation = self.stack({key: value[:, now] for key, value in frames.items()})
-        action = batch[ACTION].flatten(1, -2) if batch[ACTION].ndim == 2 else batch[ACTION][:, 0]
+        action = batch[ACTION].reshape(len(batch[ACTION]), -1, self.action_dims)[:, 0]
         demo = torch.ones_like(action[:, :1])
         if s.rl_loss_scale == 0:  # imitation only: rewards and next observations are not read
             return Batch(
@@ -206,9 +206,8 @@ class RLPolicy(PreTrainedPolicy):
             raise DataError(
                 f"The batch lacks '{key}': found {sorted(k for k in batch if k.startswith('observation.'))}."
             )
-        value = batch[key]
-        # With a single offset the loader drops the time axis of videos and vectors.
-        return value if value.ndim == len((self.config.input_features or {})[key].shape) + 2 else value[:, None]
+        # With a single offset the loader drops the time axis of videos and vectors; of a vector of one number, its own.
+        return batch[key].reshape(len(batch[key]), -1, *(self.config.input_features or {})[key].shape)
 
     # -- the Hub -----------------------------------------------------------------------------------------------
 
