@@ -9,11 +9,11 @@ from lerobot_cqn.schema import ACTION, NEXT_REWARD, STATE
 
 from .cameras import CameraLook
 from .finding import (
-    LEVELS,
     NAMED,
     Finding,
     Level,
     advice_to_drop,
+    by_level,
     count,
     episodes_text,
     more,
@@ -84,7 +84,7 @@ def findings(
         *_tasks(numbers),
         *_size(numbers, cameras),
     ]
-    return sorted(found, key=lambda f: LEVELS.index(f.level))
+    return sorted(found, key=by_level)
 
 
 def _readable(dataset: Dataset, numbers: Numbers) -> Iterator[Finding]:

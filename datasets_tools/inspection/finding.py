@@ -12,6 +12,7 @@ __all__ = [
     "Finding",
     "Level",
     "advice_to_drop",
+    "by_level",
     "count",
     "episodes_text",
     "more",
@@ -41,6 +42,11 @@ class Finding:
     where: str
     text: str
     advice: str = ""
+
+
+def by_level(finding: Finding) -> int:
+    """Rank for sorting, errors first."""
+    return LEVELS.index(finding.level)
 
 
 def count(items: Sequence[int]) -> str:

@@ -126,7 +126,9 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
 
     from .cameras import look, missing_videos
     from .checks import Dataset, findings
+    from .finding import by_level
     from .numbers import measure
+    from .statistics import statistics
 
     missing = missing_videos(source)
     with progress() as bar:
@@ -148,7 +150,8 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
     except Exception:  # a damaged history is not what is inspected here
         deltas = False
     dataset = Dataset(repo_id, source.fps, list(source.features), len(source.episodes), deltas)
-    return Inspection(findings(dataset, numbers, cameras, missing), dataset, numbers, cameras)
+    found = sorted([*findings(dataset, numbers, cameras, missing), *statistics(source, numbers)], key=by_level)
+    return Inspection(found, dataset, numbers, cameras)
 
 
 def _write_page(path: Path, inspection: Inspection) -> None:
