@@ -46,6 +46,7 @@ class RLPolicy(PreTrainedPolicy):
         super().__init__(config)
         if dataset_meta is not None and config.push_to_hub:  # at the end of a training that begins now
             refuse_to_start()
+        _leave_out_depth(config, dataset_meta)
         config.validate_features()
         shapes = {key: feature.shape for key, feature in sorted(config.image_features.items())}
         self.view_keys = tuple(shapes)
@@ -153,7 +154,7 @@ class RLPolicy(PreTrainedPolicy):
         now = [deltas.index(index) for index in range(1 - s.frame_stack, 1)]
         frames = {key: self._with_time(batch, key) for key in (*self.view_keys, *self.low_dim_keys)}
         observation = self.stack({key: value[:, now] for key, value in frames.items()})
-        action = batch[ACTION].flatten(1, -2) if batch[ACTION].ndim == 2 else batch[ACTION][:, 0]
+        action = batch[ACTION].reshape(len(batch[ACTION]), -1, self.action_dims)[:, 0]
         demo = torch.ones_like(action[:, :1])
         if s.rl_loss_scale == 0:  # imitation only: rewards and next observations are not read
             return Batch(
@@ -205,9 +206,8 @@ class RLPolicy(PreTrainedPolicy):
             raise DataError(
                 f"The batch lacks '{key}': found {sorted(k for k in batch if k.startswith('observation.'))}."
             )
-        value = batch[key]
-        # With a single offset the loader drops the time axis of videos and vectors.
-        return value if value.ndim == len((self.config.input_features or {})[key].shape) + 2 else value[:, None]
+        # With a single offset the loader drops the time axis of videos and vectors; of a vector of one number, its own.
+        return batch[key].reshape(len(batch[key]), -1, *(self.config.input_features or {})[key].shape)
 
     # -- the Hub -----------------------------------------------------------------------------------------------
 
@@ -243,3 +243,11 @@ class RLPolicy(PreTrainedPolicy):
 
         push = super().push_model_to_hub
         retried(lambda: push(cfg, *args, **kwargs), PUSH_WAITS, explained, logger.warning)
+
+
+def _leave_out_depth(config: RLConfig, meta: Any) -> None:
+    """Take the depth cameras of the dataset `meta` out of what a policy sees: distances are not scaled like colours."""
+    seen = [key for key in getattr(meta, "depth_keys", ()) if key in (config.input_features or {})]
+    if seen:
+        config.input_features = {k: f for k, f in (config.input_features or {}).items() if k not in seen}
+        logger.warning("Depth is not looked at: %s is left out; the policy sees the other cameras.", ", ".join(seen))

@@ -31,6 +31,7 @@ from .base_config import RLConfig
 from .errors import DataError
 from .fit_pictures import FitPicturesProcessorStep
 from .joint_goals import DeltaToGoalProcessorStep, RememberJointsProcessorStep, converted_deltas
+from .scaling_check import check_scaling
 from .schema import BOUND_PROCESSOR
 
 __all__ = ["BoundObservationProcessorStep", "Stats", "make_processors", "scaling_stats"]
@@ -103,13 +104,15 @@ def make_processors(
     dataset_stats: LeRobot's statistics (`min`, `max`, `mean`, `std` per feature); None leaves values as they are.
     dataset_meta: LeRobot's metadata of the dataset; where its absolute actions were turned into deltas, the pipelines
         turn the policy's back into absolute goals. By default the one that the policy was made for.
-    Raises DataError where the dataset's history is damaged.
+    Raises DataError where the dataset's history is damaged, or statistics are missing or not those of its data.
     """
     # lerobot-train hands the metadata to `make_policy` only, which leaves it here.
     meta = getattr(config, "_runtime_dataset_meta", None) if dataset_meta is None else dataset_meta
     remember, to_goal = _goal_steps(meta)
     stats = _tensors_to_numpy(dataset_stats or {})
     margin = config.settings.action_margin
+    if meta is not None and ACTION in meta.features:
+        check_scaling(stats, meta, margin=margin, state_bound=config.settings.state_bound)
     features: dict[str, PolicyFeature] = {**(config.input_features or {}), **(config.output_features or {})}
     norm_map = {FeatureType(k): NormalizationMode(v) for k, v in config.normalization_mapping.items()}
     pre = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]](

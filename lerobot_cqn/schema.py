@@ -37,6 +37,7 @@ __all__ = [
     "Batch",
     "Observation",
     "dimension_names",
+    "has_names",
     "read_history",
 ]
 
@@ -113,14 +114,33 @@ def read_history(folder: Path) -> list[dict[str, Any]]:
 
 
 def dimension_names(feature: Mapping[str, Any]) -> list[str]:
-    """Names of a vector's dimensions, whichever way the recorder nested them; numbers where there are none."""
+    """Names of a vector's dimensions, whichever way the recorder nested them; numbers where there are none.
+
+    A name that several dimensions share is followed by their number, as in ``joint#2``.
+    """
+    names = _names(feature)
+    if names is None:
+        return [str(i) for i in range(prod(feature["shape"]))]
+    return [n if names.count(n) == 1 else f"{n}#{i}" for i, n in enumerate(names)]
+
+
+def has_names(feature: Mapping[str, Any]) -> bool:
+    """Whether the recorder named each dimension of a vector, no two alike."""
+    names = _names(feature)
+    return names is not None and len(set(names)) == len(names)
+
+
+def _names(feature: Mapping[str, Any]) -> list[str] | None:
+    """Names as recorded, in the order of the dimensions; None where there is not one for each."""
 
     def flat(names: Any) -> list[str]:
         if isinstance(names, str):
             return [names]
-        inner = names.values() if isinstance(names, Mapping) else names if isinstance(names, Sequence) else ()
-        return [name for value in inner for name in flat(value)]
+        if isinstance(names, Mapping):
+            if names and all(isinstance(place, int) for place in names.values()):
+                return sorted(names, key=lambda name: names[name])  # {"delta_x": 0, …}, as LeRobot's teleoperators
+            return flat(list(names.values()))
+        return [name for value in names for name in flat(value)] if isinstance(names, Sequence) else []
 
-    size = prod(feature["shape"])
     names = flat(feature.get("names") or ())
-    return names if len(names) == size else [str(i) for i in range(size)]
+    return names if len(names) == prod(feature["shape"]) else None

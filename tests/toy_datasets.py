@@ -50,7 +50,8 @@ def make_dataset(
         for step in range(length):
             last = step == length - 1
             frame: dict[str, Any] = {action: rng.uniform(-0.1, 0.3, dims[1]).astype(np.float32)}
-            frame[action][-1] = 0.25  # a dimension that never moves
+            if dims[1] > 1:
+                frame[action][-1] = 0.25  # a dimension that never moves
             if state:
                 frame["observation.state"] = rng.normal(size=dims[0]).astype(np.float32)
                 if (episode, step) == nan_at:

@@ -198,7 +198,9 @@ def new_agent(run: ValidRun, data: Demonstrations | None, env_bounds: Bounds | N
         raise ConfigError("An arm needs demonstrations, or a policy that was trained on some: give --dataset.repo_id.")
     source: dict[str, Any] = {"env_cfg": run.acts_in} if meta is None else {"ds_meta": meta}
     policy: Any = make_policy(run.policy, **source)
-    stats: dict[str, Any] = {} if meta is None else dict(meta.stats or {})
+    stats: dict[str, Any] = (
+        {} if data is None else dict(data.dataset.meta.stats or {})
+    )  # its rows are there from here on
     if run.config.recipe.action_bounds == "environment":
         if meta is not None and converted_deltas(meta) is not None:
             raise ConfigError(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lerobot_cqn.delta_actions import DeltaJoints, Kind
 from lerobot_cqn.schema import ACTION, STATE
 
-__all__ = ["absolute_action", "delta_action", "to_absolute", "to_delta"]
+__all__ = ["absolute_action", "delta_action", "float_dtype", "to_absolute", "to_delta"]
 
 type Array = NDArray[np.float64]
 
@@ -50,17 +50,25 @@ def to_absolute(delta: NDArray[Any], state: NDArray[Any], kind: Kind) -> Array:
 
 
 def delta_action(columns: Mapping[str, Any], deltas: DeltaJoints) -> NDArray[Any]:
-    """(T, A) an episode's absolute actions with the chosen dimensions as differences, in their dtype."""
+    """(T, A) an episode's absolute actions with the chosen dimensions as differences, as :func:`float_dtype` says."""
     return _convert(columns, deltas, to_delta)
 
 
 def absolute_action(columns: Mapping[str, Any], deltas: DeltaJoints) -> NDArray[Any]:
-    """(T, A) an episode's delta actions with all dimensions absolute, in their dtype."""
+    """(T, A) an episode's delta actions with all dimensions absolute, as :func:`float_dtype` says."""
     return _convert(columns, deltas, to_absolute)
 
 
+def float_dtype(dtype: str) -> str:
+    """The dtype in which differences of such numbers are kept: itself for floats, else one that holds them exactly."""
+    if np.issubdtype(np.dtype(dtype), np.floating):
+        return dtype
+    return "float32" if np.dtype(dtype).itemsize <= 2 else "float64"
+
+
 def _convert(columns: Mapping[str, Any], deltas: DeltaJoints, function: Any) -> NDArray[Any]:
-    action: NDArray[Any] = np.array(columns[ACTION], copy=True)
+    recorded = columns[ACTION]  # unsigned numbers would turn -7 into 65529
+    action: NDArray[Any] = np.array(recorded, float_dtype(str(recorded.dtype)))
     joints, own = list(deltas.action_dims), list(deltas.state_dims)
     action[:, joints] = function(action[:, joints], columns[STATE][:, own], deltas.kind)
     return action

@@ -12,6 +12,7 @@ threshold of s[k'], and so is what a[k] led to: the kept action explains the mot
 motion adds up. Since only kept steps are compared, doing it again drops nothing.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -20,12 +21,23 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.errors import DataError
 
-__all__ = ["Compare", "EpisodeReport", "Rule", "gripper_events", "keep_mask", "pause_runs", "report_episode"]
+__all__ = [
+    "DRIVES",
+    "Compare",
+    "EpisodeReport",
+    "Rule",
+    "drives",
+    "gripper_events",
+    "keep_mask",
+    "pause_runs",
+    "report_episode",
+]
 
 type Mask = NDArray[np.bool_]
 type Compare = Literal["after", "before"]
 
 NEAR_GRIPPER = 3
+DRIVES = 0.05  # of the largest value of a velocity; what is slower is noise of a reading at rest
 
 
 @dataclass(frozen=True)
@@ -42,6 +54,8 @@ class Rule:
         keep_last: steps at the end that are always kept; >= 1, for the last one carries the reward.
         min_pause: shorter pauses are left in; >= 1 step.
         compare: "after" compares with the next kept step, "before" with the last one.
+        rates_state, rates_action: dimensions that are velocities: a step at which one is above its limit is no pause.
+        limits_state, limits_action: of those, in their units; >= 0.
     """
 
     joints: tuple[int, ...]
@@ -53,6 +67,10 @@ class Rule:
     keep_last: int = 1
     min_pause: int = 1
     compare: Compare = "after"
+    rates_state: tuple[int, ...] = ()
+    limits_state: tuple[float, ...] = ()
+    rates_action: tuple[int, ...] = ()
+    limits_action: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -103,8 +121,9 @@ def keep_mask(state: NDArray[Any], action: NDArray[Any], rule: Rule, always: Mas
     """Mark the steps to keep.
 
     A step is a pause when no joint differs by its threshold or more from the next kept step (compare="before": from the
-    last kept one). Steps at which the gripper changes, state or command, are kept; so are ``always``, the first and the
-    last steps asked for. The steps that are kept, taken for an episode of their own, would all be kept again.
+    last kept one), and no velocity is above its limit. Steps at which the gripper changes, state or command, are kept;
+    so are ``always``, the first and the last steps asked for. The steps that are kept, taken for an episode of their
+    own, would all be kept again.
 
     Args:
         state: (T, S) measured state.
@@ -121,7 +140,8 @@ def keep_mask(state: NDArray[Any], action: NDArray[Any], rule: Rule, always: Mas
     steps = len(state)
     if steps == 0 or len(action) != steps:
         raise DataError(f"Expected as many actions as states and at least one; got {len(action)} and {steps}.")
-    wanted = np.zeros(steps, dtype=bool) if always is None else always
+    wanted = drives(state, rule.rates_state, rule.limits_state) | drives(action, rule.rates_action, rule.limits_action)
+    wanted = wanted if always is None else wanted | always
     rows: NDArray[np.int64] = np.arange(steps)
     while True:  # what goes may bring two gripper positions together that a step between them had kept apart
         mask = _keep_once(state[rows], action[rows], rule, wanted[rows])
@@ -188,6 +208,12 @@ def _pushing(commanded: NDArray[Any], keep: Mask, rule: Rule) -> int:
     """Dropped steps at which a joint's command moved by the smallest threshold or more."""
     changes = np.abs(np.diff(np.asarray(commanded, np.float64), axis=0, prepend=commanded[:1])).max(axis=1, initial=0)
     return int((~keep & (changes >= min(rule.thresholds, default=np.inf))).sum())
+
+
+def drives(values: NDArray[Any], rates: Sequence[int], limits: Sequence[float]) -> Mask:
+    """(T,) steps of (T, D) ``values`` at which a velocity is above its limit: motion, though its value stays."""
+    above = np.abs(np.asarray(values, np.float64)[:, list(rates)]) > np.asarray(limits)
+    return np.asarray(above.any(axis=1), bool)
 
 
 def gripper_events(state: NDArray[Any], action: NDArray[Any], rule: Rule) -> Mask:

@@ -1,17 +1,22 @@
 """Write a view as a new dataset: pictures decoded once and encoded once, or not touched at all where none changes."""
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from lerobot.configs import RGBEncoderConfig
+from lerobot.datasets.compute_stats import sample_indices
 from rich.progress import Progress
 
 from lerobot_cqn.errors import DataError
 
 from ..terminal.console import note
+from ..views.episode import Camera
 from ..views.view import View
+from .decoded import Decoded
 from .rewrite import all_features, rewrite, traced_columns, write_bounds
 from .source import Source
 from .target import Target, new_dataset, skip_entry, write_history
@@ -90,16 +95,18 @@ def _encode(
     done = Written()
     _refuse_unknown_kinds(source)
     features = {k: {n: v for n, v in f.items() if n != "info"} for k, f in all_features(view).items()}
+    encoder = _encoder(source, crf)
+    kept_as_is = {k for k in view.cameras if view.cameras[k] == Camera() and _encoded_alike(source, k, encoder)}
     _note_losses(source)
     line = bar.add_task("Writing frames", total=sum(lengths.values()))
     writer = new_dataset(
-        repo_id, root, fps=view.fps, features=features, robot_type=source.meta.robot_type, encoder=_encoder(source, crf)
+        repo_id, root, fps=view.fps, features=features, robot_type=source.meta.robot_type, encoder=encoder
     )
     with writer as target:
         kept: list[int] = []
         for index in view.episodes:
             try:
-                for frame, task in _frames(view, index):
+                for frame, task in _frames(view, index, kept_as_is):
                     target.add(frame, task)
                     bar.advance(line)
                 target.save_episode()
@@ -116,11 +123,15 @@ def _encode(
     return done
 
 
-def _frames(view: View, index: int) -> Iterator[tuple[dict[str, Any], str]]:
-    """The steps of an episode as LeRobot frames."""
+def _frames(view: View, index: int, alike: set[str]) -> Iterator[tuple[dict[str, Any], str]]:
+    """The steps of an episode as LeRobot frames; ``alike``: cameras whose pictures are encoded as they were."""
     episode, columns = view.episode(index), traced_columns(view, index)
-    rows = np.arange(len(episode))
-    for row, pictures in enumerate(view.camera_frames(episode, rows)):
+    rows, measured = np.arange(len(episode)), set(sample_indices(len(episode)))
+    for row, pictures in enumerate(view.camera_frames(episode, rows, decoded=True)):
+        for key, picture in pictures.items():
+            if isinstance(picture, Decoded):
+                key_frame = picture.key or key not in alike
+                pictures[key] = dataclasses.replace(picture, key=key_frame, measured=row in measured)
         yield {**{k: v[row] for k, v in columns.items()}, **pictures}, episode.tasks[row]
 
 
@@ -144,12 +155,8 @@ def _refuse_unknown_kinds(source: Source) -> None:
             note(f"The sound of '{key}' is lost: LeRobot does not keep it when videos are encoded anew.")
 
 
-def _encoder(source: Source, crf: int | None) -> Any:
+def _encoder(source: Source, crf: int | None) -> RGBEncoderConfig | None:
     """The source's video settings, where this machine can encode them; else LeRobot's default."""
-    import dataclasses
-
-    from lerobot.configs import RGBEncoderConfig
-
     settings = {k: source.meta.features[k].get("info") or {} for k in source.meta.video_keys}
     for key, info in settings.items():
         try:
@@ -161,6 +168,15 @@ def _encoder(source: Source, crf: int | None) -> Any:
             note(f"The cameras were encoded differently; all are written like '{key}'.")
         return encoder if crf is None else dataclasses.replace(encoder, crf=crf)
     return None
+
+
+def _encoded_alike(source: Source, key: str, encoder: RGBEncoderConfig | None) -> bool:
+    """Whether the source says how a video was encoded, and the new one is encoded in the same way."""
+    if encoder is None or key not in source.meta.video_keys:
+        return False
+    info = source.meta.features[key].get("info") or {}
+    said = all(info.get(f"video.{name}") is not None for name in ("codec", "pix_fmt", "g", "crf"))
+    return said and RGBEncoderConfig.from_video_info(info) == encoder
 
 
 def _codec(info: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Pictures from video files, one after the other, cut out and scaled on the way. Each file is decoded once."""
+"""Pictures from video files, one after the other; each file is decoded once. Single pictures, cut out and scaled."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lerobot_cqn.errors import DataError
 
 from ..views.episode import Camera
+from .decoded import Colours, Decoded
 
 __all__ = ["picture_size", "shaped", "video_pictures"]
 
@@ -28,7 +29,7 @@ def picture_size(feature: dict[str, Any]) -> tuple[int, int]:
 
 def video_pictures(
     path: Path, times: NDArray[np.float64], fps: int, episode: int, frames: NDArray[np.int64]
-) -> Iterator[Picture]:
+) -> Iterator[Decoded]:
     """Yield the pictures nearest to ascending ``times`` from front to back, without going back in the file.
 
     Args:
@@ -39,7 +40,7 @@ def video_pictures(
         frames: (K,) numbers of the frames in the episode, for error messages.
 
     Yields:
-        (H, W, 3) uint8.
+        pictures; ``key`` where it is a key frame, or the one before it in the file is not the one yielded before it.
 
     Raises:
         DataError: the file cannot be opened, or a frame is damaged or not there.
@@ -52,14 +53,16 @@ def video_pictures(
             if stream.time_base is None:
                 raise ValueError("the video has no time base")
             container.seek(max(0, int((times[0] - 0.5 / fps) / stream.time_base)), stream=stream)
+            colours, follows = Colours.of(stream.codec_context), False
             for frame in container.decode(stream):
                 if frame.time is None or frame.time < times[position] - 0.5 / fps:
+                    follows = False
                     continue
-                picture: Picture | None = None
+                before = position
                 while position < len(times) and abs(frame.time - times[position]) < 0.5 / fps:
-                    picture = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8) if picture is None else picture
                     position += 1
-                    yield picture
+                    yield Decoded(frame, colours, key=bool(frame.key_frame) or not follows)
+                follows = position > before
                 if position == len(times):
                     return
                 if frame.time > times[position] + 0.5 / fps:

@@ -68,4 +68,9 @@ def readable(source: Source, actions: str, *, skip_bad_episodes: bool, needs_vid
 def _deltas(source: Source, actions: str) -> DeltaJoints | None:
     if actions == "auto":
         return source.deltas
-    return None if actions == "absolute" else DeltaJoints(cast(Kind, actions), *match_joints(source.features))
+    if actions == "absolute":
+        return None
+    matched = match_joints(source.features)
+    if remark := matched.remark():
+        note(remark)
+    return DeltaJoints(cast(Kind, actions), matched.action_dims, matched.state_dims)

@@ -55,7 +55,8 @@ def rewrite(view: View, source: Source, root: Path, bar: Progress) -> None:
         _copy_rest(source.root, folder, bar)
         stats = _write_numbers(view, source, folder, bar)
         _write_episodes(source, folder, stats)
-        old = {k: v for k, v in (source.meta.stats or {}).items() if k in view.features or "." not in k}
+        known = source.meta.stats or _from_episodes(source)
+        old = {k: v for k, v in known.items() if k in view.features or "." not in k}
         write_stats({**old, **aggregate_stats(list(stats.values()))}, folder)
         info = json.loads((source.root / "meta/info.json").read_text())
         own = {k: v for k, v in info["features"].items() if k not in source.features}
@@ -149,6 +150,20 @@ def _write_episodes(source: Source, folder: Path, stats: dict[int, Stats]) -> No
         target = folder / path.relative_to(source.root)
         target.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(table, target)
+
+
+def _from_episodes(source: Source) -> Stats:
+    """Statistics of the whole from those that LeRobot keeps of each episode, where ``meta/stats.json`` is lost."""
+    each: dict[int, Stats] = {index: {} for index in source.episodes}
+    for path in sorted((source.root / "meta/episodes").rglob("*.parquet")):
+        table = pq.read_table(path)
+        for name in table.column_names:
+            if name.startswith("stats/"):
+                key, _, kind = name.removeprefix("stats/").rpartition("/")
+                for index, value in zip(table["episode_index"].to_pylist(), table[name].to_pylist(), strict=True):
+                    each.setdefault(index, {}).setdefault(key, {})[kind] = np.asarray(value)
+    whole: Stats = aggregate_stats(list(each.values())) if all(each.values()) else {}
+    return whole
 
 
 def _plain(features: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:

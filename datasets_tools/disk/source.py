@@ -18,8 +18,9 @@ from lerobot_cqn.errors import DataError
 
 from ..views.episode import Bounds, Camera, Episode
 from ..views.view import View
+from .decoded import Colours, Decoded
 from .folders import local_root
-from .pictures import shaped, video_pictures
+from .pictures import picture_size, shaped, video_pictures
 from .target import read_history
 
 __all__ = ["Source", "open_source"]
@@ -39,6 +40,7 @@ class Source(View):
         self._arrow = self.rows.with_format("arrow")
         self._cache: dict[int, Episode] = {}
         self._cached_bytes = 0
+        self._colours: dict[str, tuple[Path, Colours]] = {}
         if len(self.rows) != meta.total_frames:
             raise DataError(
                 f"{root}: meta/info.json declares {meta.total_frames} frames, the parquet files hold"
@@ -137,23 +139,41 @@ class Source(View):
         return episode
 
     def camera_frames(
-        self, episode: Episode, steps: NDArray[np.int64], cameras: Mapping[str, Camera] | None = None
+        self,
+        episode: Episode,
+        steps: NDArray[np.int64],
+        cameras: Mapping[str, Camera] | None = None,
+        *,
+        decoded: bool = False,
     ) -> Iterator[dict[str, Any]]:
         """As :meth:`View.camera_frames`; ``episode`` may be what a view made of the one here."""
         wanted = self.cameras if cameras is None else cameras
         stills = [k for k in wanted if k in self.meta.image_keys]
         videos = {k: self._video(episode, k, steps) for k in wanted if k in self.meta.video_keys}
         for step in steps:
-            pictures = {k: next(frames) for k, frames in videos.items()}
-            if stills:
-                row = int(episode.start + episode.frames[step])
-                pictures |= {k: self._still(episode, k, row) for k in stills}
-            yield {k: shaped(pictures[k], wanted[k]) for k in wanted}
+            pictures = {k: next(frames).shaped(wanted[k]) for k, frames in videos.items()}
+            row = int(episode.start + episode.frames[step])
+            single = {k: shaped(self._still(episode, k, row), wanted[k]) for k in stills}
+            yield single | (pictures if decoded else {k: p.rgb() for k, p in pictures.items()})
 
-    def _video(self, episode: Episode, key: str, steps: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
+    def _video(self, episode: Episode, key: str, steps: NDArray[np.int64]) -> Iterator[Decoded]:
+        """Pictures of a camera; raises DataError where they are of another size or colour space than they should be."""
         offset = float(self.meta.episodes[episode.index][f"videos/{key}/from_timestamp"])
-        path = self.video_path(episode.index, key)
-        return video_pictures(path, offset + episode.times[steps], self.fps, episode.index, episode.frames[steps])
+        path, declared = self.video_path(episode.index, key), picture_size(self.features[key])
+        times = offset + episode.times[steps]
+        for picture in video_pictures(path, times, self.fps, episode.index, episode.frames[steps]):
+            if picture.size != declared:
+                raise DataError(
+                    f"Video {path}: its pictures are {picture.size[0]}x{picture.size[1]}, but meta/info.json says"
+                    f" {declared[0]}x{declared[1]} (height x width); correct the shape of '{key}' there."
+                )
+            first, colours = self._colours.setdefault(key, (path, picture.colours))
+            if colours != picture.colours:
+                raise DataError(
+                    f"Video {path}: its colours ({picture.colours}) are not those of {first} ({colours}); encode both"
+                    " alike before they come into one dataset."
+                )
+            yield picture
 
     def _still(self, episode: Episode, key: str, row: int) -> NDArray[np.uint8]:
         try:

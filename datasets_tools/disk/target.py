@@ -3,7 +3,6 @@
 import contextlib
 import ctypes
 import json
-import queue
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,7 +16,9 @@ from lerobot_cqn.errors import OutputError
 from lerobot_cqn.history_text import numbered
 from lerobot_cqn.schema import HISTORY, read_history
 
+from .decoded import Decoded, Handed
 from .folders import new_folder
+from .video_encoder import VideoEncoder
 
 __all__ = [
     "HISTORY",
@@ -40,8 +41,9 @@ class Target:
         self.folder = folder
 
     def add(self, frame: dict[str, Any], task: str) -> None:
-        """Append one step; shapes and dtypes are those of the features."""
-        self.dataset.add_frame({**frame, "task": task})
+        """Append one step; shapes and dtypes are those of the features, pictures arrays or decoded ones."""
+        handed = {k: Handed.of(v) if isinstance(v, Decoded) else v for k, v in frame.items()}
+        self.dataset.add_frame({**handed, "task": task})
 
     def save_episode(self) -> None:
         """Close the episode: statistics, video, parquet."""
@@ -67,20 +69,6 @@ class Target:
         return int(self.dataset.meta.total_frames)
 
 
-class _PatientEncoder(StreamingVideoEncoder):
-    """Encodes while frames come in, and waits for the encoder where LeRobot's own would drop a frame."""
-
-    def feed_frame(self, video_key: str, image: Any) -> None:
-        thread, frames = self._threads[video_key], self._frame_queues[video_key]
-        while thread.is_alive():
-            try:
-                frames.put(image, timeout=1)
-            except queue.Full:
-                continue
-            return
-        raise RuntimeError(f"The encoder of '{video_key}' stopped; is the disk full?")
-
-
 class _Dataset(LeRobotDataset):
     """LeRobot's dataset with an encoder that loses nothing."""
 
@@ -88,7 +76,7 @@ class _Dataset(LeRobotDataset):
     def _build_streaming_encoder(
         fps: int, rgb_encoder: Any, depth_encoder: Any, encoder_queue_maxsize: int, encoder_threads: int | None
     ) -> StreamingVideoEncoder:
-        return _PatientEncoder(fps, rgb_encoder, depth_encoder, encoder_queue_maxsize, encoder_threads)
+        return VideoEncoder(fps, rgb_encoder, depth_encoder, encoder_queue_maxsize, encoder_threads)
 
 
 @contextlib.contextmanager

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.errors import DataError
 
-from ..decisions.joints import match_joints
+from ..decisions.joints import Matched, match_joints
 from ..disk.source import Source
 
 __all__ = ["Correlation", "Follow", "FollowKind"]
@@ -60,11 +60,13 @@ class Follow:
     Attributes:
         action_dims, state_dims: (J,) matching dimensions of action and state, grippers left out.
         fps: steps a second.
+        remark: what was taken for granted in matching; "" where nothing was.
     """
 
-    def __init__(self, action_dims: tuple[int, ...], state_dims: tuple[int, ...], fps: int) -> None:
-        self.action_dims, self.state_dims, self.fps = action_dims, state_dims, fps
-        joints = len(action_dims)
+    def __init__(self, matched: Matched, fps: float) -> None:
+        self.action_dims, self.state_dims, self.fps = matched.action_dims, matched.state_dims, fps
+        self.remark = matched.remark()
+        joints = len(self.action_dims)
         self._lags = range(min(MAX_LAG, round(MAX_LAG_S * fps)) + 1)
         self._level = Correlation(joints)
         self._steps = [Correlation(joints) for _ in self._lags]  # of a change of command and of the state
@@ -75,10 +77,10 @@ class Follow:
     def of(cls, source: Source) -> Self | None:
         """For a dataset whose actions can be matched with its states by name or number; else None."""
         try:
-            action_dims, state_dims = match_joints(source.features)
+            matched = match_joints(source.features)
         except DataError:
             return None
-        return cls(action_dims, state_dims, source.fps) if action_dims else None
+        return cls(matched, source.fps) if matched.action_dims else None
 
     def add(self, action: Array, state: Array) -> None:
         """Take in one episode: (T, A) and (T, S)."""

@@ -2,19 +2,28 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from lerobot_cqn.schema import ACTION, NEXT_REWARD, STATE
 
 from .cameras import CameraLook
+from .finding import (
+    NAMED,
+    Finding,
+    Level,
+    advice_to_drop,
+    by_level,
+    count,
+    episodes_text,
+    more,
+    names_text,
+    places_text,
+)
+from .meaning import meaning
 from .numbers import Dimension, Numbers
 
-__all__ = ["LEVELS", "Dataset", "Finding", "Level", "Memory", "findings", "memory"]
-
-Level = Literal["error", "warning", "note"]
-LEVELS: tuple[Level, ...] = ("error", "warning", "note")
+__all__ = ["Dataset", "Memory", "findings", "memory"]
 
 SHORT = 5  # steps
 JITTER = 0.05  # of a time step
@@ -23,26 +32,6 @@ LAG_S = 0.3
 SQUEEZE = 4.0  # how much wider the whole range of an action is than 98 % of its values
 PAPER_SIZE = 84  # pixels, the side of the paper's pictures
 GIB = 2**30
-NAMED = 6  # things listed in a sentence
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing a person should know.
-
-    Attributes:
-        level: error: training fails or learns nothing from this; warning: it suffers; note: good to know.
-        code: short name for machines, e.g. `missing_video`.
-        where: dataset, column, file or episode it is about.
-        text: what was found, one sentence.
-        advice: what to do, one sentence; empty where there is nothing to do.
-    """
-
-    level: Level
-    code: str
-    where: str
-    text: str
-    advice: str = ""
 
 
 @dataclass(frozen=True)
@@ -89,12 +78,13 @@ def findings(
         *_ranges(dataset, numbers),
         *_jumps(numbers),
         *_grippers(numbers),
+        *meaning(numbers),
         *_following(dataset, numbers),
         *_duplicates(numbers),
         *_tasks(numbers),
         *_size(numbers, cameras),
     ]
-    return sorted(found, key=lambda f: LEVELS.index(f.level))
+    return sorted(found, key=by_level)
 
 
 def _readable(dataset: Dataset, numbers: Numbers) -> Iterator[Finding]:
@@ -113,13 +103,17 @@ def _readable(dataset: Dataset, numbers: Numbers) -> Iterator[Finding]:
     short = [e.index for e in numbers.episodes if e.steps < SHORT]
     if short:
         yield Finding(
-            "warning", "short_episode", _episodes(short), f"{_count(short)} shorter than {SHORT} steps.", _delete(short)
+            "warning",
+            "short_episode",
+            episodes_text(short),
+            f"{count(short)} shorter than {SHORT} steps.",
+            advice_to_drop(short),
         )
 
 
 def _videos(cameras: Sequence[CameraLook], missing: Mapping[str, Sequence[int]]) -> Iterator[Finding]:
     for path, held in missing.items():
-        text = f"The video file is missing; it holds {_episodes(list(held))}."
+        text = f"The video file is missing; it holds {episodes_text(list(held))}."
         yield Finding("error", "missing_video", path, text, "Copy it back or download the dataset again.")
     for camera in cameras:
         for reason in camera.broken:
@@ -128,11 +122,11 @@ def _videos(cameras: Sequence[CameraLook], missing: Mapping[str, Sequence[int]])
         for code, places, what in (("black", camera.dark, "black"), ("blank", camera.flat, "of a single colour")):
             if places:
                 level: Level = "error" if len(places) == camera.looked else "warning"
-                text = f"{len(places)} of {camera.looked} pictures looked at are {what}: {_places(places)}."
+                text = f"{len(places)} of {camera.looked} pictures looked at are {what}: {places_text(places)}."
                 yield Finding(level, f"{code}_camera", camera.key, text, "Check cable and exposure; record again.")
         if camera.frozen:
             spans = ", ".join(f"episode {e} from frame {a} to {b}" for e, a, b in camera.frozen[:NAMED])
-            text = f"The picture does not change while the arm moves: {spans}{_more(camera.frozen)}."
+            text = f"The picture does not change while the arm moves: {spans}{more(camera.frozen)}."
             yield Finding(
                 "warning", "frozen_camera", camera.key, text, "See whether the arm is in view; else record again."
             )
@@ -144,7 +138,7 @@ def _times(dataset: Dataset, numbers: Numbers) -> Iterator[Finding]:
         worst = max(e.jitter for e in numbers.episodes)
         text = f"Steps last up to {worst:.0%} more or less than 1/{dataset.fps} s."
         advice = "Record with a free computer; pictures and joints may not belong together."
-        yield Finding("warning", "jitter", _episodes(uneven), text, advice)
+        yield Finding("warning", "jitter", episodes_text(uneven), text, advice)
 
 
 def _pauses(dataset: Dataset, numbers: Numbers) -> Iterator[Finding]:
@@ -166,9 +160,9 @@ def _pauses(dataset: Dataset, numbers: Numbers) -> Iterator[Finding]:
     held = [e.index for e in numbers.episodes if e.still_end > dataset.fps]
     if found.clear and held:
         longest = max(e.still_end for e in numbers.episodes) / dataset.fps
-        text = f"{_count(held)} with more than a second in which nothing moves, up to {longest:.1f} s."
+        text = f"{count(held)} with more than a second in which nothing moves, up to {longest:.1f} s."
         advice = "Keep part of it with --keep_last if the policy should learn to hold still at the goal."
-        yield Finding("note", "still_end", _episodes(held), text, advice)
+        yield Finding("note", "still_end", episodes_text(held), text, advice)
 
 
 def _rewards(numbers: Numbers) -> Iterator[Finding]:
@@ -182,16 +176,16 @@ def _rewards(numbers: Numbers) -> Iterator[Finding]:
         advice = "Say which episodes succeeded: cqn-data label; without a success there is nothing to learn from."
         yield Finding("error", "no_success", NEXT_REWARD, text, advice)
     elif failed:
-        text = f"{_count(failed)} without a reward above 0: failures."
-        yield Finding("note", "failures", _episodes(failed), text, "Fine if they did fail.")
+        text = f"{count(failed)} without a reward above 0: failures."
+        yield Finding("note", "failures", episodes_text(failed), text, "Fine if they did fail.")
     early = [e.index for e in numbers.episodes if e.first_reward is not None and e.first_reward < e.steps - 1]
     if early:
-        text = f"{_count(early)} going on after the first reward; cqn-train leaves out what comes after it."
-        yield Finding("note", "early_reward", _episodes(early), text)
+        text = f"{count(early)} going on after the first reward; cqn-train leaves out what comes after it."
+        yield Finding("note", "early_reward", episodes_text(early), text)
     disagree = [e.index for e in numbers.episodes if e.success not in (None, e.first_reward is not None)]
     if disagree:
-        text = f"{_count(disagree)} where next.success and {NEXT_REWARD} disagree."
-        yield Finding("warning", "reward_mismatch", _episodes(disagree), text, "Correct one of the two.")
+        text = f"{count(disagree)} where next.success and {NEXT_REWARD} disagree."
+        yield Finding("warning", "reward_mismatch", episodes_text(disagree), text, "Correct one of the two.")
 
 
 def _ranges(dataset: Dataset, numbers: Numbers) -> Iterator[Finding]:
@@ -209,7 +203,7 @@ def _ranges(dataset: Dataset, numbers: Numbers) -> Iterator[Finding]:
     if wide:
         worst = max(wide, key=_squeezed)
         text = (
-            f"98 % of the values fill a small part of the range ({_names(wide)}; worst '{worst.name}':"
+            f"98 % of the values fill a small part of the range ({names_text(wide)}; worst '{worst.name}':"
             f" {worst.inner_low:.3g} to {worst.inner_high:.3g} of {worst.low:.3g} to {worst.high:.3g})."
         )
         advice = "CQN divides the whole range into bins: narrow it with cqn-data bounds --quantile=0.01."
@@ -222,7 +216,7 @@ def _ranges(dataset: Dataset, numbers: Numbers) -> Iterator[Finding]:
 def _constant(column: str, dimensions: Sequence[Dimension], advice: str) -> Iterator[Finding]:
     still = [d for d in dimensions if d.constant]
     if still:
-        text = f"{len(still)} of {len(dimensions)} never change: {_names(still)}."
+        text = f"{len(still)} of {len(dimensions)} never change: {names_text(still)}."
         yield Finding("warning", "constant_joint" if column == STATE else "constant_action", column, text, advice)
 
 
@@ -237,9 +231,9 @@ def _jumps(numbers: Numbers) -> Iterator[Finding]:
             f" {j.change:+.3g} at once{' and back' if j.back else ''}, expected less than {j.limit:.2g}"
             for j in numbers.jumps[:NAMED]
         )
-        text = f"{numbers.jump_count} jumps far beyond the usual change: {shown}{_more(range(numbers.jump_count))}."
+        text = f"{numbers.jump_count} jumps far beyond the usual change: {shown}{more(range(numbers.jump_count))}."
         advice = "A value that comes back was read wrongly; one that stays may be an angle that wraps. Look at them."
-        yield Finding("warning", "jump", _episodes(sorted({j.episode for j in numbers.jumps})), text, advice)
+        yield Finding("warning", "jump", episodes_text(sorted({j.episode for j in numbers.jumps})), text, advice)
 
 
 def _grippers(numbers: Numbers) -> Iterator[Finding]:
@@ -252,14 +246,16 @@ def _grippers(numbers: Numbers) -> Iterator[Finding]:
     counts = {e.index: e.gripper_events for e in numbers.episodes if e.gripper_events is not None}
     if counts and not any(counts.values()):
         text = "The gripper neither opens nor closes in any episode."
-        yield Finding("note", "idle_gripper", _names(grippers), text, "Fine if the task needs none.")
+        yield Finding("note", "idle_gripper", names_text(grippers), text, "Fine if the task needs none.")
         return
     usual = float(np.median(list(counts.values()))) if counts else 0
     odd = {e: n for e, n in counts.items() if n is not None and (n > 3 * max(usual, 1) or (n == 0 and usual >= 1))}
     if odd:
         listed = ", ".join(f"episode {e}: {n}" for e, n in list(odd.items())[:NAMED])
-        text = f"The gripper usually moves {usual:g} times; {listed}{_more(odd)}."
-        yield Finding("note", "gripper_events", _episodes(list(odd)), text, "See whether they are good demonstrations.")
+        text = f"The gripper usually moves {usual:g} times; {listed}{more(odd)}."
+        yield Finding(
+            "note", "gripper_events", episodes_text(list(odd)), text, "See whether they are good demonstrations."
+        )
 
 
 def _following(dataset: Dataset, numbers: Numbers) -> Iterator[Finding]:
@@ -290,14 +286,14 @@ def _duplicates(numbers: Numbers) -> Iterator[Finding]:
     if again and numbers.dimensions:
         listed = "; ".join(" = ".join(map(str, g)) for g in again[:NAMED])
         extra = [i for g in again for i in g[1:]]
-        text = f"Episodes with the same states and actions: {listed}{_more(again)}."
-        yield Finding("warning", "duplicates", _episodes(extra), text, _delete(extra))
+        text = f"Episodes with the same states and actions: {listed}{more(again)}."
+        yield Finding("warning", "duplicates", episodes_text(extra), text, advice_to_drop(extra))
 
 
 def _tasks(numbers: Numbers) -> Iterator[Finding]:
     if len(numbers.tasks) > 1:
         listed = ", ".join(f"'{t}'" for t in list(numbers.tasks)[:3])
-        listed += _more(range(len(numbers.tasks)), 3)
+        listed += more(range(len(numbers.tasks)), 3)
         text = f"{len(numbers.tasks)} different tasks ({listed}); CQN is not told which."
         yield Finding("warning", "tasks", "task", text, "Train on one task at a time.")
 
@@ -310,30 +306,3 @@ def _size(numbers: Numbers, cameras: Sequence[CameraLook]) -> Iterator[Finding]:
             f" {needed.pictures_84 / GIB:.2f} GiB at {PAPER_SIZE} x {PAPER_SIZE}."
         )
         yield Finding("note", "memory", "cameras", text, "Make the pictures smaller: cqn-data resize.")
-
-
-def _count(items: Sequence[int]) -> str:
-    return f"{len(items)} episode{'s' if len(items) != 1 else ''}"
-
-
-def _episodes(items: Sequence[int]) -> str:
-    listed = ", ".join(map(str, items[:NAMED]))
-    return f"episode{'s' if len(items) != 1 else ''} {listed}{_more(items)}"
-
-
-def _names(dimensions: Sequence[Dimension]) -> str:
-    unique = list(dict.fromkeys(d.name for d in dimensions))
-    return ", ".join(unique[:NAMED]) + _more(unique)
-
-
-def _places(places: Sequence[tuple[int, int]]) -> str:
-    return ", ".join(f"episode {e} frame {f}" for e, f in places[:NAMED]) + _more(places)
-
-
-def _more(items: "Sequence[object] | Mapping[int, object]", shown: int = NAMED) -> str:
-    return f" and {len(items) - shown} more" if len(items) > shown else ""
-
-
-def _delete(items: Sequence[int]) -> str:
-    listed = ", ".join(map(str, items[:NAMED])) + (", …" if len(items) > NAMED else "")
-    return f"Leave out: cqn-data drop --episodes='[{listed}]'"

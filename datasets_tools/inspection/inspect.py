@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
     from ..disk.source import Source
     from .cameras import CameraLook
-    from .checks import Dataset, Finding
+    from .checks import Dataset
+    from .finding import Finding
     from .numbers import Numbers
 
 __all__ = ["InspectConfig", "Inspection", "help", "inspect_dataset", "main"]
@@ -92,7 +93,7 @@ def main(args: list[str]) -> int:
     config = parse(InspectConfig, args)
     load_lerobot()
     from ..disk.source import open_source
-    from .checks import Finding
+    from .finding import Finding
 
     page = config.page  # once: after it is written, the next free name is another one
     if page is not None:
@@ -125,7 +126,9 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
 
     from .cameras import look, missing_videos
     from .checks import Dataset, findings
+    from .finding import by_level
     from .numbers import measure
+    from .statistics import statistics
 
     missing = missing_videos(source)
     with progress() as bar:
@@ -147,7 +150,8 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
     except Exception:  # a damaged history is not what is inspected here
         deltas = False
     dataset = Dataset(repo_id, source.fps, list(source.features), len(source.episodes), deltas)
-    return Inspection(findings(dataset, numbers, cameras, missing), dataset, numbers, cameras)
+    found = sorted([*findings(dataset, numbers, cameras, missing), *statistics(source, numbers)], key=by_level)
+    return Inspection(found, dataset, numbers, cameras)
 
 
 def _write_page(path: Path, inspection: Inspection) -> None:
@@ -224,7 +228,8 @@ def _print_json(config: InspectConfig, inspection: Inspection) -> None:
 
 def as_json(repo_id: str, inspection: Inspection) -> dict[str, Any]:
     """Plain types; the shape is the same whatever was found, with None for what could not be measured."""
-    from .checks import LEVELS, memory
+    from .checks import memory
+    from .finding import LEVELS
 
     dataset, numbers, cameras = inspection.dataset, inspection.numbers, inspection.cameras
     report: dict[str, Any] = {

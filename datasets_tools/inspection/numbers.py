@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from lerobot_cqn.errors import DataError
 from lerobot_cqn.schema import ACTION, NEXT_REWARD, NEXT_SUCCESS, STATE, dimension_names
 
-from ..decisions.joints import gripper_dims
+from ..decisions.angles import full_turn, turned
+from ..decisions.joints import gripper_dims, rate_dims
 from ..decisions.pause_threshold import Motion, Suggestion
-from ..decisions.pauses import pause_runs
+from ..decisions.pauses import DRIVES, drives, pause_runs
 from ..disk.source import Source
 from ..views.episode import Episode
 from .action_lag import Follow
@@ -76,15 +77,22 @@ class EpisodeNumbers:
 
 @dataclass
 class Dimension:
-    """One dimension of state or action: range, and the range without the outer percent on either side."""
+    """One dimension of state or action: range, and the range without the outer percent on either side.
+
+    Attributes:
+        gripper, rate: whether its name says that it is a gripper, or a velocity.
+        turned: (episode, frame) of the first change by nearly a full turn, which angles that wrap have; None without.
+    """
 
     column: str
     name: str
     gripper: bool
+    rate: bool = False
     low: float = np.inf
     high: float = -np.inf
     inner_low: float = 0.0
     inner_high: float = 0.0
+    turned: tuple[int, int] | None = None
     histogram: NDArray[np.int64] = field(default_factory=lambda: np.zeros(RANGE_BINS, np.int64), repr=False)
 
     @property
@@ -128,17 +136,17 @@ def measure(source: Source, advance: Callable[[], None] = lambda: None) -> Numbe
     for column in (STATE, ACTION):
         if column in source.features:
             names = dimension_names(source.features[column])
-            grippers = gripper_dims(names)
-            numbers.dimensions += [Dimension(column, n, i in grippers) for i, n in enumerate(names)]
-    joints = [i for i, d in enumerate(numbers.of(STATE)) if not d.gripper]
+            grippers, rates = gripper_dims(names), rate_dims(names)
+            numbers.dimensions += [Dimension(column, n, i in grippers, i in rates) for i, n in enumerate(names)]
+    joints = [i for i, d in enumerate(numbers.of(STATE)) if not d.gripper and not d.rate]
     motion, commanded, numbers.follow = Motion(), Motion(), Follow.of(source)
     for episode in _readable(source, numbers, advance):
         _first_look(source, episode, numbers)
-        if STATE in episode.columns:
+        if STATE in episode.columns and joints:
             motion.add(_vectors(episode, STATE)[:, joints])
         if ACTION in episode.columns:
             commanded.add(_vectors(episode, ACTION))
-    if STATE in source.features:
+    if STATE in source.features and joints:
         numbers.threshold = motion.suggest()
     limits = {STATE: _far(numbers.of(STATE), joints, motion)}
     if numbers.follow is not None and numbers.follow.kind() == "absolute":
@@ -199,17 +207,37 @@ def _second_look(
         for position, dimension in enumerate(numbers.of(column)):
             if not dimension.constant:
                 dimension.histogram += np.histogram(values[:, position], RANGE_BINS, (dimension.low, dimension.high))[0]
+        _find_turns(episode.index, values, numbers.of(column))
         if column in limits:
             _find_jumps(episode.index, values, column, numbers, limits[column])
     if numbers.threshold is not None and len(episode) > 1 and joints:
         moves = np.abs(np.diff(_vectors(episode, STATE)[:, joints], axis=0)).max(axis=1)
-        moving = np.flatnonzero(moves >= numbers.threshold.threshold)
+        goes = (moves >= numbers.threshold.threshold) | _drives(episode, numbers)[:-1]
+        moving = np.flatnonzero(goes)
         summary.still = 1 - len(moving) / len(moves)
         if summary in numbers.episodes[:DRAWN]:
-            summary.runs = pause_runs(moves >= numbers.threshold.threshold)
+            summary.runs = pause_runs(goes)
         summary.still_start = int(moving[0]) if len(moving) else len(moves)
         summary.still_end = len(moves) - 1 - int(moving[-1]) if len(moving) else 0
     summary.gripper_events = _gripper_events(episode, numbers)
+
+
+def _drives(episode: Episode, numbers: Numbers) -> NDArray[np.bool_]:
+    """(T,) steps at which a velocity is above what a filter takes for rest."""
+    found = np.zeros(len(episode), bool)
+    for column in (STATE, ACTION):
+        rates = [(i, DRIVES * max(abs(d.low), abs(d.high))) for i, d in enumerate(numbers.of(column)) if d.rate]
+        if rates and column in episode.columns:
+            dims, limits = zip(*rates, strict=True)
+            found |= drives(_vectors(episode, column), dims, limits)
+    return found
+
+
+def _find_turns(index: int, values: Array, dimensions: list[Dimension]) -> None:
+    low, high = (np.array([getattr(d, end) for d in dimensions]) for end in ("low", "high"))
+    for step, place in np.argwhere(turned(np.diff(values, axis=0), full_turn(low, high))):
+        dimension = dimensions[place]
+        dimension.turned = dimension.turned or (index, int(step) + 1)
 
 
 def _far(dimensions: list[Dimension], places: Sequence[int], motion: Motion) -> Array:

@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterable, Sequence
 from lerobot_cqn.schema import STATE
 
 from .cameras import CameraLook
-from .checks import LEVELS, PAPER_SIZE, Dataset, Finding, memory
+from .checks import PAPER_SIZE, Dataset, memory
+from .finding import LEVELS, Finding
 from .numbers import Dimension, EpisodeNumbers, Numbers
 from .svg import pauses, spark, still_share, threshold_histogram
 

@@ -1,6 +1,7 @@
 """``cqn-data delta``: absolute joint actions to delta joint actions on disk, and back. The maths: see ``deltas``."""
 
 import dataclasses
+import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
@@ -13,6 +14,9 @@ from ..terminal.options import option
 from .job import Step, settings_of
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from ..views.episode import Episode
     from ..views.view import DerivedView, View
 
@@ -93,9 +97,7 @@ of the next step minus this one (the way back gives where the arm went, not what
         return view.deltas
 
     def _wanted(self, view: "View") -> "DeltaJoints":
-        import numpy as np
-
-        from ..decisions.joints import gripper_dims, match_joints
+        from ..decisions.joints import Matched, gripper_dims, match_joints, no_positions
 
         if view.deltas is not None:
             raise ConfigError(f"The actions are deltas already (kind {view.deltas.kind}); nothing to do.")
@@ -108,22 +110,62 @@ of the next step minus this one (the way back gives where the arm went, not what
         if ACTION not in view.features:
             if self.of not in ("auto", "state"):
                 raise DataError(f"There is no '{ACTION}' to take commands from; leave out --of={self.of}.")
-            left_out = gripper_dims(names, self.keep_absolute)
+            left_out = {*gripper_dims(names, self.keep_absolute), *no_positions(names)}
             joints = tuple(i for i in range(len(names)) if i not in left_out)
-            return DeltaJoints("state", joints, joints)
-        matched = match_joints(view.features, self.keep_absolute)
-        kind = cast(Kind, "command" if self.of == "auto" else self.of)
-        if not matched[0]:
-            raise DataError(f"No action dimension would be a delta: {', '.join(names)} are all kept absolute.")
-        low, high, gap = np.inf, -np.inf, []
+            matched, kind = Matched(joints, joints, "name", tuple(names[i] for i in no_positions(names))), "state"
+        else:
+            matched, kind = match_joints(view.features, self.keep_absolute), self.of
+        if remark := matched.remark():
+            note(remark)
+        if not matched.action_dims:
+            raise DataError(
+                f"No action dimension would be a delta: {', '.join(names)} are grippers, kept absolute, or no"
+                " positions; leave out this step."
+            )
+        deltas = DeltaJoints(cast(Kind, "command" if kind == "auto" else kind), matched.action_dims, matched.state_dims)
+        self._check(view, deltas)
+        return deltas
+
+    def _check(self, view: "View", deltas: DeltaJoints) -> None:
+        """Refuse angles that wrap, and say so where the actions look like deltas already."""
+        import numpy as np
+
+        from ..decisions.angles import full_turn, turned
+        from ..decisions.deltas import to_delta
+        from ..decisions.joints import gripper_dims
+
+        low, high, moved, gap = np.inf, -np.inf, -np.inf, []
         for index in view.episodes:
-            columns = view.episode(index).columns
-            state = columns[STATE][:, list(matched[1])]
-            low, high = np.minimum(low, state.min(axis=0)), np.maximum(high, state.max(axis=0))
-            gap.append(np.abs(columns[ACTION][:, list(matched[0])] - state).mean(axis=0))
-        if (np.mean(gap, axis=0) > np.maximum(high - low, 1e-9)).mean() > 0.5:
+            state, action = _joints(view.episode(index), deltas)
+            both = np.concatenate([state, action])
+            low, high = np.minimum(low, both.min(axis=0)), np.maximum(high, both.max(axis=0))
+            moved = np.maximum(moved, np.ptp(state, axis=0))
+            gap.append(np.abs(action - state).mean(axis=0))
+        if ACTION in view.features and (np.mean(gap, axis=0) > np.maximum(moved, 1e-9)).mean() > 0.5:
             note("Most commands are farther from the arm than it ever moves: these actions look like deltas already.")
-        return DeltaJoints(kind, *matched)
+        turns = full_turn(np.asarray(low), np.asarray(high))
+        for index in view.episodes if np.isfinite(turns).any() else ():
+            state, action = _joints(view.episode(index), deltas)
+            found = np.argwhere(turned(to_delta(action, state, deltas.kind), turns))
+            if len(found):
+                frame, joint = (int(n) for n in found[0])
+                names = dimension_names(view.features.get(ACTION, view.features[STATE]))
+                wraps = [names[d] for d, turn in zip(deltas.action_dims, turns, strict=True) if np.isfinite(turn)]
+                kept = [n for i, n in enumerate(names) if n in wraps or i in gripper_dims(names, self.keep_absolute)]
+                raise DataError(
+                    f"Episode {index}, frame {frame}: the difference of '{names[deltas.action_dims[joint]]}' would be"
+                    f" nearly a full turn ({turns[joint]:.4g}): an angle that wraps, or a wrong reading. Keep such"
+                    f" angles absolute: --keep_absolute='{json.dumps(kept)}'."
+                )
+
+
+def _joints(episode: "Episode", deltas: DeltaJoints) -> "tuple[NDArray[np.float64], NDArray[np.float64]]":
+    """(T, J) measured and commanded joints of an episode; where there are no commands, the next measurement."""
+    import numpy as np
+
+    state = np.asarray(episode.columns[STATE], np.float64)
+    action = np.asarray(episode.columns.get(ACTION, np.concatenate([state[1:], state[-1:]])), np.float64)
+    return state[:, list(deltas.state_dims)], action[:, list(deltas.action_dims)]
 
 
 def _show(view: "View") -> None:

@@ -127,8 +127,8 @@ Delta actions are formed anew, so that they connect the states that are left.
 
     def rule(self, view: "View") -> "tuple[Rule, dict[str, Any]]":
         """Rule of what a pause is in this dataset, and reasons for an automatic threshold."""
-        from ..decisions.joints import gripper_dims
-        from ..decisions.pauses import Rule
+        from ..decisions.joints import gripper_dims, rate_dims
+        from ..decisions.pauses import DRIVES, Rule
 
         for key in (STATE, ACTION):
             if key not in view.features:
@@ -141,16 +141,22 @@ Delta actions are formed anew, so that they connect the states that are left.
             gripper_dims(states, self.gripper_names),
             gripper_dims(actions, self.gripper_names),
         )
-        joints = tuple(i for i in range(len(states)) if i not in gripper_state)
+        rates_state = tuple(i for i in rate_dims(states) if i not in gripper_state)
+        rates_action = tuple(i for i in rate_dims(actions) if i not in gripper_action)
+        joints = tuple(i for i in range(len(states)) if i not in gripper_state and i not in rates_state)
+        known = [*(states[i] for i in (*joints, *rates_state)), *(actions[i] for i in rates_action)]
         for name in self.joint_thresholds:
-            if name not in [states[i] for i in joints]:
-                raise ConfigError(one_of("joint", name, [states[i] for i in joints]))
+            if name not in known:
+                raise ConfigError(one_of("joint", name, known))
         if not gripper_state and not gripper_action:
             note('No dimension is named "gripper", so gripper changes are not protected; name it with --gripper_names.')
         threshold = 0.005 if self.threshold is None else self.threshold
         why: dict[str, Any] = {}
         if self.auto:
             threshold, why = _choose(view, joints)
+        if rates_state or rates_action:
+            named = ", ".join(dict.fromkeys([states[i] for i in rates_state] + [actions[i] for i in rates_action]))
+            note(f"Velocities: {named}; a step at which one is above {DRIVES:.0%} of its largest value is no pause.")
         return Rule(
             joints=joints,
             thresholds=tuple(self.joint_thresholds.get(states[i], threshold) for i in joints),
@@ -161,7 +167,23 @@ Delta actions are formed anew, so that they connect the states that are left.
             keep_last=self.keep_last,
             min_pause=self.min_pause,
             compare="after" if self.compare == "after" else "before",
+            rates_state=rates_state,
+            limits_state=self._limits(view, STATE, rates_state, states),
+            rates_action=rates_action,
+            limits_action=self._limits(view, ACTION, rates_action, actions),
         ), why
+
+    def _limits(self, view: "View", column: str, rates: tuple[int, ...], names: list[str]) -> tuple[float, ...]:
+        """For each velocity the value above which something moves: as asked for, else a share of the largest one."""
+        import numpy as np
+
+        from ..decisions.pauses import DRIVES
+
+        largest = np.zeros(len(names))
+        for index in view.episodes if rates else ():
+            values = np.abs(np.asarray(view.episode(index).columns[column], np.float64))
+            largest = np.maximum(largest, values.reshape(len(values), -1).max(axis=0))
+        return tuple(self.joint_thresholds.get(names[i], DRIVES * float(largest[i])) for i in rates)
 
     def _advise(self, view: "View", reports: "list[EpisodeReport]") -> None:
         """Help with the choice where it looks wrong."""
@@ -180,6 +202,8 @@ def _choose(view: "View", joints: tuple[int, ...]) -> tuple[float, dict[str, Any
     """A threshold from the data, and why; the earlier one where the pauses it would be read from are gone."""
     from ..decisions.pause_threshold import suggest
 
+    if not joints:  # velocities only
+        return 0.005, {}
     for entry in reversed(view.history()):
         if entry.get("operation") == "filter" and "threshold" in entry.get("settings", {}):
             reason = "as in the earlier filter, since most pauses to judge by are gone."

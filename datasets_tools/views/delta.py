@@ -8,7 +8,7 @@ import numpy as np
 from lerobot_cqn.delta_actions import DeltaJoints
 from lerobot_cqn.schema import ACTION, STATE
 
-from ..decisions.deltas import absolute_action, delta_action
+from ..decisions.deltas import absolute_action, delta_action, float_dtype
 from .episode import Bounds, Episode
 from .view import DerivedView
 
@@ -23,9 +23,9 @@ class DeltaView(DerivedView):
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:
-        """With an action, if there was none."""
+        """With an action, if there was none, and with one that has room for differences."""
         features = self.parent.features
-        return features if ACTION in features else {**features, ACTION: dict(features[STATE])}
+        return _with_float_action(features if ACTION in features else {**features, ACTION: dict(features[STATE])})
 
     @property
     def deltas(self) -> DeltaJoints | None:
@@ -52,6 +52,11 @@ class AbsoluteView(DerivedView):
     """With all action dimensions absolute."""
 
     @property
+    def features(self) -> dict[str, dict[str, Any]]:
+        """With an action that has room for sums."""
+        return _with_float_action(self.parent.features)
+
+    @property
     def deltas(self) -> DeltaJoints | None:
         """None: all actions are absolute."""
         return None
@@ -65,3 +70,8 @@ class AbsoluteView(DerivedView):
         """The steps with absolute actions."""
         episode, deltas = self.parent.episode(index), self.parent.deltas
         return episode if deltas is None else episode.with_columns({ACTION: absolute_action(episode.columns, deltas)})
+
+
+def _with_float_action(features: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    action = features[ACTION]
+    return {**features, ACTION: {**action, "dtype": float_dtype(action["dtype"])}}

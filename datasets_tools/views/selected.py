@@ -62,7 +62,24 @@ def select(
         return chosen
     commanded = episode.columns[ACTION] if deltas is None else absolute_action(episode.columns, deltas)
     chosen = chosen.with_columns({ACTION: commanded[rows if action_rows is None else action_rows]})
-    return chosen if deltas is None else chosen.with_columns({ACTION: delta_action(chosen.columns, deltas)})
+    if deltas is None:
+        return chosen
+    return chosen.with_columns({ACTION: _in_dtype(delta_action(chosen.columns, deltas), episode)})
+
+
+def _in_dtype(values: NDArray[Any], episode: Episode) -> NDArray[Any]:
+    """Actions in the dtype of the episode's own; raises DataError where whole numbers of that size cannot hold them."""
+    dtype = episode.columns[ACTION].dtype
+    if np.issubdtype(dtype, np.integer):
+        room = np.iinfo(dtype)
+        frames = np.flatnonzero(((values < room.min) | (values > room.max)).any(axis=1))
+        if len(frames):
+            raise DataError(
+                f"Episode {episode.index}, step {int(frames[0])}: an action formed anew does not fit into {dtype}; make"
+                " the actions absolute first, in a dataset of floats: cqn-data delta --to=absolute."
+            )
+        values = np.rint(values)
+    return values.astype(dtype)
 
 
 def filtered_view(view: View, rule: Rule, min_steps: int, *, skip: bool) -> tuple[Selected, list[EpisodeReport]]:
@@ -105,7 +122,7 @@ def commanded_joints(view: View, episode: Episode) -> NDArray[Any] | None:
     if view.deltas is not None:
         return absolute_action(episode.columns, view.deltas)[:, list(view.deltas.action_dims)]
     try:
-        actions, _ = match_joints(view.features)
+        actions = match_joints(view.features).action_dims
     except DataError:
         return None
     commanded: NDArray[Any] = episode.columns[ACTION][:, list(actions)]

@@ -58,7 +58,12 @@ class View(ABC):
 
     @abstractmethod
     def camera_frames(
-        self, episode: Episode, steps: NDArray[np.int64], cameras: Mapping[str, Camera] | None = None
+        self,
+        episode: Episode,
+        steps: NDArray[np.int64],
+        cameras: Mapping[str, Camera] | None = None,
+        *,
+        decoded: bool = False,
     ) -> Iterator[dict[str, Any]]:
         """Pictures of the given steps in order, each file read once from front to back.
 
@@ -66,9 +71,10 @@ class View(ABC):
             episode: from :meth:`episode`.
             steps: (K,) ascending rows of the episode.
             cameras: what becomes of each camera's pictures; by default as in this view.
+            decoded: pictures of videos in the colours in which they are stored, to be encoded again.
 
         Yields:
-            {camera: (H, W, 3) uint8}.
+            {camera: (H, W, 3) uint8}; or, of a video, what its decoder gave.
 
         Raises:
             DataError: a file or a frame cannot be read; names file, episode and frame.
@@ -130,10 +136,15 @@ class DerivedView(View):
         return self.parent.episode(index)
 
     def camera_frames(
-        self, episode: Episode, steps: NDArray[np.int64], cameras: Mapping[str, Camera] | None = None
+        self,
+        episode: Episode,
+        steps: NDArray[np.int64],
+        cameras: Mapping[str, Camera] | None = None,
+        *,
+        decoded: bool = False,
     ) -> Iterator[dict[str, Any]]:
         """Pictures from the source, as this view has them."""
-        return self.parent.camera_frames(episode, steps, self.cameras if cameras is None else cameras)
+        return self.parent.camera_frames(episode, steps, self.cameras if cameras is None else cameras, decoded=decoded)
 
     def settle(self, written: Sequence[int]) -> None:
         """Settle the view before."""

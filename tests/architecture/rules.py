@@ -21,7 +21,8 @@ ROOM_MAY_USE: dict[str, tuple[str, ...]] = {
     "lerobot_cqn": (),
     "lerobot_cqn._plugin": ("train.envs", "train.sim_arm"),
     "datasets_tools": tuple(
-        f"lerobot_cqn.{name}" for name in ["errors", "schema", "delta_actions", "hub_retry", "history_text"]
+        f"lerobot_cqn.{name}"
+        for name in ["errors", "schema", "delta_actions", "hub_retry", "history_text", "scaling_check"]
     ),
     "train": ("lerobot_cqn", "datasets_tools"),
 }
@@ -33,9 +34,9 @@ FLOORS: dict[str, str] = {
     # tensors in, tensors out, never a configuration (up to losses); then networks; then what LeRobot sees
     "lerobot_cqn": (
         "errors schema|ranges discretisation|distributional|augmentation|n_step losses settings networks model "
-        "critic|actor_critic|learner delta_actions joint_goals|fit_pictures|history_text|hub_retry base_config "
-        "model_card|processors base_policy configuration_cqn|configuration_drqv2 processor_cqn|processor_drqv2 "
-        "modeling_cqn|modeling_drqv2"
+        "critic|actor_critic|learner delta_actions|scaling_check joint_goals|fit_pictures|history_text|hub_retry "
+        "base_config model_card|processors base_policy configuration_cqn|configuration_drqv2 "
+        "processor_cqn|processor_drqv2 modeling_cqn|modeling_drqv2"
     ),
     "datasets_tools": "terminal decisions views disk operations formats|inspection|hub record|cli",
     "train": (

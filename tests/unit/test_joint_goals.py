@@ -124,7 +124,7 @@ def history(root: Path, *entries: dict[str, Any]) -> SimpleNamespace:
         "action": {"shape": (D,), "names": ACTION_NAMES},
         "observation.state": {"shape": (P,), "names": {"motors": STATE_NAMES}},
     }
-    return SimpleNamespace(root=root, features=features)
+    return SimpleNamespace(root=root, features=features, stats=None)
 
 
 def entry(operation: str, kind: str | None) -> dict[str, Any]:

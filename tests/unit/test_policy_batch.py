@@ -28,6 +28,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "rewarded": {"reward": True, "failed": (1,)},
     "filmed": {"camera": True, "reward": True, "failed": (2,), "environment_state": 2},
     "pixels": {"camera": True, "state": False},
+    "one_number": {"dims": (1, 1), "reward": True},
 }
 
 

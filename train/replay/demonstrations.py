@@ -146,7 +146,10 @@ class Demonstrations:
 
 
 def _column(columns: Any, key: str) -> NDArray[Any]:
-    return np.stack(columns[key]).astype(np.float32) if len(columns) else np.zeros((0, 1), np.float32)
+    """[K, D] values of a column; LeRobot keeps a vector of one number as the number."""
+    if not len(columns):
+        return np.zeros((0, 1), np.float32)
+    return np.stack(columns[key]).astype(np.float32).reshape(len(columns), -1)
 
 
 def _check_finite(raw: dict[str, NDArray[Any]], episodes: NDArray[Any]) -> None:
