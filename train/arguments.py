@@ -92,7 +92,7 @@ def parse(arguments: Sequence[str]) -> RunConfig:
         output_dir = parser.parse_arg("output_dir", arguments)
         if output_dir is None:
             raise ConfigError("--resume needs the run's folder: give --output_dir=DIR.")
-        config_file = str(last_checkpoint(Path(output_dir)) / "pretrained_model" / "train_config.json")
+        config_file = str(last_checkpoint(Path(output_dir), logger.warning) / "pretrained_model" / "train_config.json")
     config_file = parser.parse_arg("config_path", arguments) or config_file
     arguments = parser.filter_arg("config_path", arguments)
     path = parser.parse_arg("policy.path", arguments)

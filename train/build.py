@@ -31,7 +31,10 @@ from .push.send import check_account
 from .replay.buffer import Replay
 from .replay.demonstrations import Demonstrations
 from .replay.episode import Episode
-from .run.checkpoint import Counters, last_checkpoint, restore, save, seed_everything
+from .replay.files import Place
+from .run.beginning import BEGUN, beginning, forget_beginning
+from .run.checkpoint import Counters, last_checkpoint, restore, save, seed_everything, stored_episodes
+from .run.durable import check_room
 from .run.first_look import draw_batch, warnings_about
 from .run.metrics import Log, Metrics, start_tensorboard, start_wandb
 from .run.progress import Monitors
@@ -79,9 +82,17 @@ def build(
     else:
         world = make_arm(run.acts_in, run, checkpoint, data, monitor.message, should_stop, stack, clock)
     agent, replay = world.agent, make_replay(run)
+    begun = run.output_dir / BEGUN
     with nothing_left(None if config.resume else run.output_dir):
+        if checkpoint is None:
+            stack.enter_context(beginning(begun))
+        else:
+            accepted = config.replay.accept_loss
+            replay.examine(stored_episodes(checkpoint), accept_loss=accepted, say=monitor.message)
         load_demonstrations(run, data, world, replay, monitor)
-        finished = replay.reopen() if checkpoint is not None else []
+        finished: list[Place] = []
+        if checkpoint is not None:
+            finished = replay.reopen()
     run.output_dir.mkdir(parents=True, exist_ok=True)
     if checkpoint is None and replay.episodes:
         picture = run.output_dir / "first_batch.png"
@@ -99,7 +110,9 @@ def build(
     def save_checkpoint() -> None:
         save(
             run.output_dir, agent, learner, rng, counters, tables=metrics.sizes(), run_config=draccus.encode(config),
+            episodes=replay.numbers,
         )  # fmt: skip
+        begun.unlink(missing_ok=True)
 
     if world.board is not None:
         recall(world.board, run.output_dir)
@@ -113,6 +126,9 @@ def build(
 
 def check_outside(run: ValidRun, say: Callable[[str], None]) -> None:
     """Make sure of the output folder and the Hub account, before anything is made. Raises CQNError; says warnings."""
+    check_room(run.output_dir)
+    if not run.config.resume:
+        forget_beginning(run.output_dir)
     if not run.config.resume and run.output_dir.exists() and any(run.output_dir.iterdir()):
         raise OutputExistsError(
             f"{run.output_dir} exists and is not empty: give another --output_dir, or --resume=true to continue."
@@ -260,6 +276,7 @@ def nothing_left(folder: Path | None) -> Iterator[None]:
     except BaseException:
         if folder is not None:
             shutil.rmtree(folder / "replay", ignore_errors=True)
+            (folder / BEGUN).unlink(missing_ok=True)
             with contextlib.suppress(OSError):
                 folder.rmdir()
         raise

@@ -79,6 +79,7 @@ class ReplaySettings:
 
     # of the demonstrations and the run's episodes together; the oldest make room
     capacity_gib: float = number(16.0, above=0)
+    accept_loss: bool = False  # go on with --resume where episodes of the replay are damaged or gone
     sampling: str = "episodes"  # uniform over episodes, then over their steps (the reference's); or over "steps"
 
 

@@ -55,11 +55,15 @@ class Display:
     def __init__(self) -> None:
         self.shown = 0
         self.said: dict[str, float | str] = {}
+        self.lines: list[str] = []
         self.begun: list[int] = []
         self.ended: list[tuple[int, int]] = []
 
     def show(self, pictures: Mapping[str, NDArray[np.uint8]]) -> None:
         self.shown += 1
+
+    def message(self, text: str) -> None:
+        self.lines.append(text)
 
     def health(self, **values: float | str) -> None:
         self.said = values
@@ -105,14 +109,11 @@ class Bench:
     robot: SimUR5e
     leader: HandLeader
     display: Display
+    world: World  # of the robot, also while it is not connected
     goals: list[Array] = field(default_factory=list)  # everything that reached the motors
     farthest: float = 0.0  # of a goal from where the joint was in the simulator, degrees
     _threads: list[threading.Thread] = field(default_factory=list)
     _failed: list[BaseException] = field(default_factory=list)
-
-    @property
-    def world(self) -> World:
-        return self.robot.world
 
     @property
     def joints(self) -> Array:
@@ -225,8 +226,8 @@ def bench(
     )
     assert isinstance(robot, SimUR5e)
     robot.clock = clock
+    robot.connect()
     if start is not None:
-        robot.connect()
         robot.world.arm.place(start, 0.0)
         robot.world.lay_out()
     hand = HandLeader()
@@ -236,7 +237,7 @@ def bench(
     )  # fmt: skip
     session, display = Session(can_free=guard.can_release), Display()
     env = ArmEnvironment(made, session, display, should_stop, clock)
-    made_bench = Bench(clock, env, session, robot, hand, display)
+    made_bench = Bench(clock, env, session, robot, hand, display, robot.world)
     read, send = robot.get_observation, robot.send_action
 
     def slowly() -> dict[str, Any]:
@@ -246,7 +247,7 @@ def bench(
     def spy(action: dict[str, Any]) -> dict[str, Any]:
         sent = send(action)
         made_bench.goals.append(np.array([action[name] for name in NAMES]))
-        away = np.abs(made_bench.goals[-1][:6] - np.degrees(robot.world.arm.joints)).max()
+        away = np.abs(made_bench.goals[-1][:6] - np.degrees(made_bench.world.arm.joints)).max()
         made_bench.farthest = max(made_bench.farthest, float(away))
         return sent
 

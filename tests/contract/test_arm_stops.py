@@ -38,6 +38,8 @@ class Waving:
     def prepare(self, frame: Any) -> Any:
         return frame
 
+    def low_dim(self, _: Any) -> None: ...
+
     def act(self, _: Any, *, explore: bool) -> tuple[Any, float]:
         assert not explore
         self.steps += 1

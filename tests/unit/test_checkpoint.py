@@ -114,7 +114,7 @@ def test_a_kill_at_any_moment(steps: int, tmp_path: Path, parts: tuple[Agent, Le
             _fuse["left"] = None
         shutil.rmtree(folder)
         moment += 1
-    assert moment > 10
+    assert moment > 5
     assert sorted(p.name for p in (folder / "checkpoints").iterdir()) == sorted({"000010", f"{steps:06d}", "last"})
     torch.set_rng_state(generator)
 
@@ -142,13 +142,81 @@ def test_what_is_restored(tmp_path: Path, parts: tuple[Agent, Learner, Replay]) 
         assert torch.equal(one, other)
 
 
-def test_only_the_newest_state_is_kept(tmp_path: Path, parts: tuple[Agent, Learner, Replay]) -> None:
+def test_the_two_newest_states_are_kept(tmp_path: Path, parts: tuple[Agent, Learner, Replay]) -> None:
     write = saver(tmp_path, parts)
     for steps in (10, 20, 20, 30):
         write(steps)
     folder = tmp_path / "checkpoints"
     assert sorted(p.parent.name for p in folder.glob("0*/pretrained_model")) == ["000010", "000020", "000030"]
-    assert [p.parent.name for p in folder.glob("0*/training_state")] == ["000030"]
+    assert sorted(p.parent.name for p in folder.glob("0*/training_state")) == ["000020", "000030"]
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def half(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def flipped(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 0xFF
+    path.write_bytes(bytes(data))
+
+
+@pytest.mark.parametrize("damage", [empty, half, Path.unlink])
+@pytest.mark.parametrize(
+    "name",
+    ["training_state/optimizer.pt", "training_state/torch_rng.pt", "training_state/progress.json",
+     "pretrained_model/model.safetensors", "pretrained_model/config.json", "pretrained_model/train_config.json"],
+)  # fmt: skip
+def test_a_damaged_checkpoint_is_told_of_and_the_one_before_taken(
+    name: str, damage: Callable[[Path], None], tmp_path: Path, parts: tuple[Agent, Learner, Replay]
+) -> None:
+    write = saver(tmp_path, parts)
+    for steps in (10, 20, 30):
+        write(steps)
+    damage(tmp_path / "checkpoints" / "000030" / name)
+    said: list[str] = []
+    assert last_checkpoint(tmp_path, said.append).name == "000020"
+    assert len(said) == 1
+    assert said[0].startswith("Warning: the checkpoint 000030 is damaged (")
+    assert said[0].endswith("going on from 000020.")
+    assert_whole(tmp_path, parts)
+    write(25)  # the run goes on from there, and forgets the damaged state
+    assert last_checkpoint(tmp_path).resolve().name == "000025"
+    states = sorted(p.parent.name for p in (tmp_path / "checkpoints").glob("0*/training_state"))
+    assert states == ["000020", "000025"]
+    for steps in (20, 25):
+        damage(tmp_path / "checkpoints" / f"{steps:06d}" / name)
+    with pytest.raises(DataError, match=r"No checkpoint in .* is whole \(000025: .*000020: "):
+        last_checkpoint(tmp_path)
+
+
+def test_a_changed_byte_of_the_optimiser_is_noticed(tmp_path: Path, parts: tuple[Agent, Learner, Replay]) -> None:
+    write = saver(tmp_path, parts)
+    write(10)
+    write(20)
+    flipped(tmp_path / "checkpoints" / "000020" / "training_state" / "optimizer.pt")
+    assert last_checkpoint(tmp_path).name == "000010"
+
+
+def test_a_full_disk_leaves_the_checkpoint_before(
+    tmp_path: Path, parts: tuple[Agent, Learner, Replay], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = saver(tmp_path, parts)
+    write(10)
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(OSError, match="No space left"):
+        write(20)
+    monkeypatch.undo()
+    assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == ["000010", "last"]
+    assert_whole(tmp_path, parts)
 
 
 def test_nothing_to_resume_is_said(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ EXPECTED = {
     },
     "labelling": {"success": "resetting", "failure": "resetting", "discard": "resetting"},
     "resetting": {"ready": "waiting", "home": "resetting", "free": "resetting"},
-    "faulted": {"recovered": "resetting"},
+    "faulted": {"recovered": "resetting", "free": "faulted"},
     "stopped": {},
 }  # fmt: skip
 PATHS: dict[State, list[Event]] = {
@@ -253,7 +253,7 @@ def test_an_arm_is_let_go_and_taken_again() -> None:
     assert made.free
     made.apply(Event.FREE)
     assert not made.free
-    for event in (Event.HOME, Event.START, Event.FAULT, Event.STOP):
+    for event in (Event.HOME, Event.START, Event.STOP):
         made = session(State.WAITING)
         made.apply(Event.FREE)
         made.apply(event)
@@ -292,3 +292,28 @@ def test_after_a_pause_whoever_drove_drives_on() -> None:
     made.apply(Event.HAND_BACK)
     made.apply(Event.PAUSE)
     assert made.apply(Event.RESUME) is State.RUNNING
+
+
+def test_by_hand_does_not_end_by_itself() -> None:
+    """A reading that fails while somebody holds the arm, the recovery, a label: none of them switches motors on."""
+    made = session(State.RESETTING)
+    made.apply(Event.FREE)
+    for event in (Event.FAULT, Event.FAULT, Event.RECOVERED, Event.READY, Event.FAULT, Event.RECOVERED):
+        made.apply(event)
+        assert made.free
+    made.apply(Event.FREE)
+    assert not made.free
+    driven = session(State.RUNNING)  # broken off, and taken into the hand to be brought back
+    for event in (Event.FAULT, Event.FREE, Event.RECOVERED, Event.FAILURE):
+        driven.apply(event)
+        assert driven.free == (event is not Event.FAULT)
+    driven.apply(Event.HOME)
+    assert not driven.free
+
+
+def test_what_could_not_be_held_is_still_free() -> None:
+    made = session(State.RESETTING)
+    made.apply(Event.FREE)
+    made.apply(Event.FREE)
+    made.note_free()
+    assert made.free

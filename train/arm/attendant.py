@@ -3,7 +3,7 @@
 import contextlib
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,23 @@ from ..robot.arm import Arm
 from ..robot.guard import HeldError, StoppedError
 from ..robot.readings import RobotFault
 
-__all__ = ["Attendant"]
+__all__ = ["Attendant", "Shown"]
 
 BETWEEN = (State.WAITING, State.RESETTING)
 LOOK_HZ = 10.0
 RETRY_S = 0.5
+
+
+class Shown(Protocol):
+    """What the attendant lets a person see."""
+
+    def show(self, pictures: Mapping[str, NDArray[np.uint8]]) -> None:
+        """Pictures [H, W, 3] of the cameras."""
+        ...
+
+    def message(self, text: str) -> None:
+        """A line that stays."""
+        ...
 
 
 class Attendant:
@@ -32,12 +44,12 @@ class Attendant:
         self,
         arm: Arm,
         session: Session,
-        show: Callable[[Mapping[str, NDArray[np.uint8]]], Any],
+        display: Shown,
         clock: Clock = REAL,
         should_stop: Callable[[], bool] = lambda: False,
     ) -> None:
         """Nothing runs yet. should_stop: whether the process is to end, which stops the session as a person would."""
-        self.arm, self.session, self._show, self._clock = arm, session, show, clock
+        self.arm, self.session, self._display, self._clock = arm, session, display, clock
         self._should_stop = should_stop
         self.changed = threading.Event()
         self._wake = threading.Event()
@@ -67,6 +79,8 @@ class Attendant:
 
     def fault(self, error: RobotFault) -> None:
         """Tell the session of a fault; from then on this thread tries to take the arm up again."""
+        if self.arm.guard.released:  # it cannot be held, so it is still in somebody's hand
+            self.session.note_free()
         with contextlib.suppress(RefusedError):  # stopped already
             self.session.apply(Event.FAULT, str(error))
 
@@ -108,6 +122,8 @@ class Attendant:
         elif state in IN_MOTION:
             return
         elif state is State.FAULTED:
+            if self.session.free and not guard.released:
+                guard.release()
             self._recover()
             return
         elif before in IN_MOTION or (state is State.PAUSED and before is not state):
@@ -119,18 +135,22 @@ class Attendant:
         if state in BETWEEN and self._homeward:
             self._bring_home()
         elif state is not State.STOPPED:
-            self._show(guard.read().pictures)
+            self._display.show(guard.read().pictures)
 
     def _bring_home(self) -> None:
         """Steps towards home at the control rate, until it is there or something else comes up."""
         self.session.note_homing(True)
         try:
+            self.arm.set_off()
             while self._homeward and self._may_go_home() and not self._closing.is_set():
-                self._show(self.arm.guard.read().pictures)
+                self._display.show(self.arm.guard.read().pictures)
                 self._homeward = not self.arm.step_home(self._may_go_home)
+                if not self._homeward and (short := self.arm.short_of_home()):
+                    self._display.message(short)
                 self._clock.sleep(1 / self.arm.fps)
             self._homeward = False
-            self.arm.guard.hold()
+            if self.session.state in BETWEEN:
+                self.arm.guard.hold()
         finally:
             self.session.note_homing(False)
 

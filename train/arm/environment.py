@@ -15,19 +15,15 @@ from ..robot.arm import Arm
 from ..robot.guard import HeldError, StoppedError
 from ..robot.pace import Pace
 from ..robot.readings import Reading, RobotFault
-from .attendant import Attendant
+from .attendant import Attendant, Shown
 
 __all__ = ["ArmEnvironment", "Display"]
 
 LOOK_S = 0.05  # how often a waiting thread looks whether it should stop
 
 
-class Display(Protocol):
+class Display(Shown, Protocol):
     """Display of an arm's run for its person."""
-
-    def show(self, pictures: Mapping[str, NDArray[np.uint8]]) -> None:
-        """Pictures [H, W, 3] of the cameras."""
-        ...
 
     def health(self, **values: float | str) -> None:
         """Numbers and words on the robot's health."""
@@ -62,7 +58,7 @@ class ArmEnvironment:
     ) -> None:
         self.arm, self.session, self.display, self._clock = arm, session, display, clock
         self._should_stop = should_stop
-        self._attendant = Attendant(arm, session, display.show, clock, should_stop)
+        self._attendant = Attendant(arm, session, display, clock, should_stop)
         self._pace = Pace(arm.fps, clock)
         self._steps, self._began = 0, 0.0
         self._frame: Frame = {}

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_cqn.errors import OutputError
 from lerobot_cqn.learner import Learner, NonFiniteLossError
 from lerobot_cqn.schema import Batch
 
@@ -22,6 +23,7 @@ from ..replay.files import Place
 from ..replay.recorder import Recorder
 from ..replay.standing import share_standing
 from ..run.checkpoint import Counters
+from ..run.durable import check_room
 from ..run.first_look import save_batch, write_films
 from ..run.metrics import Metrics, read_rows
 from ..run.report import unconverged
@@ -31,6 +33,7 @@ from .evaluate import Evaluation, evaluate
 __all__ = ["Trainer"]
 
 RECENT = 20  # training episodes in the progress line
+OFFLINE_SAVE_S = 120.0  # between checkpoints on the way through the offline phase
 SET_ASIDE = 5  # discarded episodes that may still be labelled otherwise
 
 
@@ -64,6 +67,8 @@ class Trainer:
     def run(self) -> None:
         """Offline phase, online phase, final evaluation. Raises Interrupted between two updates or steps."""
         self.env.open()
+        if self.counters == Counters():
+            self.save()  # from here on the run can be continued
         self.take_up(self.finished_since)
         try:
             if not self.counters.offline_done:
@@ -78,7 +83,15 @@ class Trainer:
         total = self.config.offline_updates
         self.monitor.phase("offline", total, self.counters.updates)
         self.person.learning("offline updates")
-        self.updates(total - self.counters.updates, on_update=lambda: self.monitor.advance(self.counters.updates, ""))
+        while self.replay.episodes and self.counters.updates < total:
+            until = self.clock.now + OFFLINE_SAVE_S
+            self.updates(
+                total - self.counters.updates,
+                on_update=lambda: self.monitor.advance(self.counters.updates, ""),
+                until=lambda until=until: self.clock.now > until,  # type: ignore[misc]
+            )
+            if self.counters.updates < total:
+                self.save()
         fell = unconverged(read_rows(self.metrics.output_dir / "updates.csv"))
         if fell is not None:
             self.monitor.message(
@@ -110,9 +123,18 @@ class Trainer:
         c, freq = self.counters, self.config.eval_freq
         if freq and c.env_steps // freq > before // freq and c.env_steps < self.config.steps:
             self.evaluate("online", self.config.eval.n_episodes)
+        self.check_room()
         if c.env_steps // self.config.save_freq > before // self.config.save_freq:
             self.person.learning("saving a checkpoint")
             self.save()
+
+    def check_room(self) -> None:
+        """Save and end where the disk is nearly full: there is still room for this. Raises OutputError."""
+        try:
+            check_room(self.metrics.output_dir)
+        except OutputError:
+            self.save()
+            raise
 
     def episode(self) -> None:
         """Act once from reset to end, learn while acting, and store what happened."""

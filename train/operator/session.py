@@ -58,6 +58,8 @@ LABELS: Mapping[Event, Label] = {
     Event.SUCCESS: Label.SUCCESS, Event.FAILURE: Label.FAILURE, Event.DISCARD: Label.DISCARD,
 }  # fmt: skip
 BY_ITSELF = frozenset({Event.TIME_UP, Event.ABSENT, Event.FAULT, Event.RECOVERED})
+# Nobody who does this, or to whom it happens, means that the arm shall hold itself from now on.
+KEEPS_FREE = frozenset({Event.READY, Event.FAULT, Event.RECOVERED, *LABELS})
 IN_MOTION = frozenset({State.RUNNING, State.TEACHING})  # policy or person drives the arm
 IN_EPISODE = IN_MOTION | {State.PAUSED, State.LABELLING}
 
@@ -83,7 +85,7 @@ TRANSITIONS: Mapping[State, Mapping[Event, State]] = {
         Event.PAUSE: State.RESETTING,
     },
     # What was going on is over; where an episode was, a person says how it went (see `Session.apply`).
-    State.FAULTED: {Event.STOP: State.STOPPED, Event.FAULT: State.FAULTED, Event.RECOVERED: State.RESETTING},
+    State.FAULTED: {**_ALWAYS, Event.RECOVERED: State.RESETTING, Event.FREE: State.FAULTED},
     State.STOPPED: {Event.STOP: State.STOPPED},
 }  # fmt: skip
 
@@ -106,7 +108,7 @@ class Session:
         breaks: how often an episode was paused or broken off by a fault, in all.
         homing: whether the arm is on its way home.
         leader: whether there is a leader arm to take over with; can_free: whether the arm can be moved by hand.
-        free: whether it is to be moved by hand now; every event but READY ends that.
+        free: whether it is to be moved by hand now; a fault, READY or a label do not end that, all else does.
         on_change: called after each change, with the lock held: must be quick and must not raise.
     """
 
@@ -145,7 +147,7 @@ class Session:
             before, after = self.state, TRANSITIONS[self.state][event]
             if event is Event.START:
                 self._count()
-            self.free = not self.free if event is Event.FREE else self.free and event is Event.READY
+            self.free = not self.free if event is Event.FREE else self.free and event in KEEPS_FREE
             self._home = event is Event.HOME or (self._home and event is Event.READY)
             self.homing = self.homing and event in (Event.READY, Event.HOME)
             if event in LABELS:
@@ -205,6 +207,12 @@ class Session:
         """Say what the learner is at, "" when it is done: no episode starts meanwhile."""
         with self._lock:
             self.busy = doing
+            self.on_change(self)
+
+    def note_free(self) -> None:
+        """Say that the arm is still in somebody's hand, whatever was asked for: it could not be held."""
+        with self._lock:
+            self.free = True
             self.on_change(self)
 
     def note_homing(self, on: bool) -> None:

@@ -1,7 +1,7 @@
 """Replay buffer: whole episodes, stored once; histories and n-step windows are put together when sampled."""
 
 import json
-from collections.abc import Generator
+from collections.abc import Callable, Collection, Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +15,9 @@ from lerobot_cqn.errors import ConfigError, DataError
 from lerobot_cqn.n_step import n_step_return
 from lerobot_cqn.schema import Batch, Observation
 
+from .damage import find_damage
 from .episode import Episode
-from .files import Journal, Place, Rows
+from .files import Journal, Place, Rows, earlier_layout, reserve_all
 
 __all__ = ["Replay"]
 
@@ -67,6 +68,7 @@ class Replay:
         self._buffers: dict[tuple[int, str], torch.Tensor] = {}
         self._turn = 0
         self._journal: Journal | None = None
+        self._skip_damaged = False  # lines of the journal
         if folder is not None:
             self._journal = Journal(folder / "episodes.jsonl")
 
@@ -74,6 +76,11 @@ class Replay:
     def episodes(self) -> int:
         """Episodes stored."""
         return len(self._places)
+
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the run's episodes that are stored."""
+        return [place.number for place in self._places[self._fixed :]]
 
     @property
     def demonstrations(self) -> int:
@@ -107,15 +114,8 @@ class Replay:
                 " make the pictures smaller (cqn-data resize)."
             )
         self._write(arrays, start, stop)
-        self._keep(
-            Place(
-                start=start,
-                length=len(episode),
-                terminated=episode.terminated,
-                success=episode.success,
-                demo=episode.success,
-            )
-        )
+        ended, success = episode.terminated, episode.success
+        self._keep(Place(start=start, length=len(episode), terminated=ended, success=success, demo=success))
         self._fixed, self._ring, self._head = self.episodes, stop, stop
 
     def add(self, episode: Episode, *, demo: bool, number: int = -1, note: dict[str, Any] | None = None) -> None:
@@ -149,6 +149,8 @@ class Replay:
         self._evict(place.start, place.stop)
         self._write(arrays, place.start, place.stop)
         if self._journal is not None:
+            for rows in self._rows.values():
+                rows.flush()  # before the line that says that they are complete
             self._journal.complete(place)
         self._keep(place)
         self._head = place.stop
@@ -289,9 +291,8 @@ class Replay:
 
     def _write(self, arrays: dict[str, NDArray[Any]], start: int, stop: int) -> None:
         if stop > self._reserved:
-            self._reserved = min(self.capacity, max(1024, stop, 2 * self._reserved))
-            for rows in self._rows.values():
-                rows.reserve(self._reserved)
+            wanted = min(self.capacity, max(1024, stop, 2 * self._reserved))
+            self._reserved = reserve_all(self._rows.values(), wanted, stop)
         for name, values in arrays.items():
             self._rows[name].write(start, values)
 
@@ -330,23 +331,58 @@ class Replay:
         shapes = {name: [*rows.shape, str(rows.dtype)] for name, rows in self._rows.items()}
         return {"ring": self._ring, "capacity": self.capacity, "shapes": shapes}
 
+    def examine(
+        self, expected: Collection[int], *, accept_loss: bool = False, say: Callable[[str], None] = lambda _: None
+    ) -> None:
+        """Make sure of an earlier process's files, before anything is written to them.
+
+        expected: numbers of episodes that must be told of. accept_loss: go on without those that are gone; `say` is
+        told of them. Raises DataError where episodes are gone and that is not accepted.
+        """
+        if self.folder is None or self._journal is None:
+            return
+        self._skip_damaged = accept_loss
+        untold = {*expected} - self._take_up_journal()
+        damage = find_damage(self._places, earlier_layout(self.folder)[1], untold)
+        self._places, self._head = [], 0
+        if damage is not None:
+            text = f"{self.folder} is damaged: {damage}"
+            if not accept_loss:
+                raise DataError(f"{text} Go on with those by --replay.accept_loss=true, or start a new run.")
+            say(f"Warning: {text}")
+            for place in damage.lost:
+                self._journal.announce(place.start, place.stop)
+
     def reopen(self) -> list[Place]:
         """Take up the finished episodes of an earlier process; call once the demonstrations are in.
 
-        Returns all that are still there, oldest first. Raises DataError when the dataset or the settings changed, or
-        the files are damaged.
+        Returns all that are still there, oldest first. Raises DataError when the dataset or the settings changed.
         """
         if self.folder is None or self._journal is None:
             raise DataError("This replay has no folder to take episodes up from.")
-        layout = self.folder / "layout.json"
-        written = json.loads(layout.read_text()) if layout.is_file() else None
+        written, shaped = earlier_layout(self.folder)
         if self._rows and written is not None and written != self._layout():
             raise DataError(
                 f"{self.folder} was laid out for another dataset or --replay.capacity_gib: resume with those that the"
                 " run began with, or start a new run."
             )
+        self._take_up_journal()
+        if not self._rows:  # without demonstrations their shapes come from the layout
+            self._rows = shaped
+        needed = max((p.stop for p in self._places), default=0)
+        self._reserved = reserve_all(self._rows.values(), max(needed, self._reserved), needed)
+        for place in self._places[self._fixed :]:
+            if "corrected" in place.note:  # a kill may have come between the label and its reward
+                self._label_reward(place)
+        return self._places[self._fixed :]
+
+    def _take_up_journal(self) -> set[int]:
+        """Places of all that the journal says is complete; returns the numbers of all that it tells of."""
+        assert self._journal is not None  # noqa: S101  # checked by the callers
         self._journal.repair()
-        for (start, stop), place in self._journal.entries():
+        told = set[int]()
+        for (start, stop), place in self._journal.entries(skip_damaged=self._skip_damaged):
+            told |= set() if place is None else {place.number}
             corrected = place is not None and "corrected" in place.note
             index = self._index(place.number) if place is not None and corrected else None
             if place is not None and index is not None:
@@ -356,24 +392,4 @@ class Replay:
             if place is not None:
                 self._keep(place)
                 self._head = place.stop
-        if written is not None:
-            self._restore(written)
-        for place in self._places[self._fixed :]:
-            if "corrected" in place.note:  # a kill may have come between the label and its reward
-                self._label_reward(place)
-        return self._places[self._fixed :]
-
-    def _restore(self, written: dict[str, Any]) -> None:
-        """Map the rows of the episodes that were taken up; without demonstrations their shapes come from the layout."""
-        assert self.folder is not None  # noqa: S101  # checked by the caller
-        if not self._rows:
-            for name, (*shape, dtype) in written["shapes"].items():
-                self._rows[name] = Rows(self.folder / f"{name}.bin", tuple(shape), dtype)
-        needed = max((p.stop for p in self._places), default=0)
-        for name, rows in self._rows.items():
-            path = self.folder / f"{name}.bin"
-            held = path.stat().st_size if path.is_file() else 0
-            if held < needed * rows.row_bytes:
-                raise DataError(f"{path} holds {held} bytes, expected {needed * rows.row_bytes}; it was cut off.")
-            rows.reserve(max(needed, self._reserved))
-        self._reserved = max(needed, self._reserved)
+        return told

@@ -8,7 +8,8 @@ overwrite is taken for lost.
 
 import json
 import math
-from collections.abc import Iterator
+import os
+from collections.abc import Collection, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lerobot_cqn.errors import DataError
+from lerobot_cqn.errors import DataError, OutputError
 
-__all__ = ["Journal", "Place", "Rows"]
+__all__ = ["Journal", "Place", "Rows", "earlier_layout", "reserve_all"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,9 +74,21 @@ class Rows:
         else:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with self.path.open("ab") as file:
-                file.truncate(max(rows * self.row_bytes, file.tell()))
+                held, wanted = file.tell(), rows * self.row_bytes
+                # For real: on a full disk a hole in the file would end the process when it is written to.
+                if wanted > held:
+                    os.posix_fallocate(file.fileno(), held, wanted - held)
             self._data = np.memmap(self.path, self.dtype, "r+", shape=(rows, *self.shape))
         self._view = torch.from_numpy(self._data)
+
+    def flush(self) -> None:
+        """Let what was written reach the disk."""
+        if self.path is not None and self.path.is_file():
+            number = os.open(self.path, os.O_RDONLY)
+            try:
+                os.fsync(number)
+            finally:
+                os.close(number)
 
     def write(self, start: int, values: NDArray[Any]) -> None:
         """Put rows from `start` on; they must be reserved."""
@@ -95,6 +108,36 @@ class Rows:
             return self._view.index_select(0, index).view(*rows.shape, *self.shape)
         torch.index_select(self._view, 0, index, out=out.view(rows.size, *self.shape))
         return out.view(*rows.shape, *self.shape)
+
+
+def earlier_layout(folder: Path) -> tuple[dict[str, Any] | None, dict[str, Rows]]:
+    """Layout that an earlier process wrote into a replay's folder, and its arrays; None and no arrays without one."""
+    layout = folder / "layout.json"
+    if not layout.is_file():
+        return None, {}
+    written = json.loads(layout.read_text())
+    shapes = written["shapes"].items()
+    return written, {name: Rows(folder / f"{name}.bin", tuple(shape), dtype) for name, (*shape, dtype) in shapes}
+
+
+def reserve_all(arrays: Collection[Rows], wanted: int, needed: int) -> int:
+    """Room for `wanted` rows in each array, or for `needed` where the disk has no more; returns for how many.
+
+    Raises OutputError where it has not even that.
+    """
+    for count in dict.fromkeys((wanted, needed)):
+        try:
+            for rows in arrays:
+                rows.reserve(count)
+        except OSError as error:
+            full = error
+            continue
+        return count
+    size = needed * sum(rows.row_bytes for rows in arrays) // 2**20 + 1
+    raise OutputError(
+        f"The replay needs {size} MiB on the disk and cannot have them: {full.strerror}. Free some and resume, or give "
+        "a smaller --replay.capacity_gib to a new run."
+    ) from full
 
 
 class Journal:
@@ -118,10 +161,10 @@ class Journal:
             with self.path.open("r+b") as file:
                 file.truncate(text.rfind(b"\n") + 1)
 
-    def entries(self) -> Iterator[tuple[tuple[int, int], Place | None]]:
+    def entries(self, *, skip_damaged: bool = False) -> Iterator[tuple[tuple[int, int], Place | None]]:
         """Rows that were overwritten, with the episode in them, or None where it was never completed.
 
-        Raises DataError when a line is damaged; see `repair` for the last one.
+        Raises DataError when a line is damaged and not to be skipped; see `repair` for the last one.
         """
         announced: tuple[int, int] | None = None
         lines = self.path.read_text().splitlines() if self.path.is_file() else []
@@ -131,8 +174,11 @@ class Journal:
                 place = _place(entry["episode"]) if "episode" in entry else None
                 rows = (place.start, place.stop) if place else (int(entry["writing"][0]), int(entry["writing"][1]))
             except (ValueError, KeyError, TypeError, IndexError) as error:
+                if skip_damaged:
+                    continue
                 raise DataError(
-                    f"{self.path}, line {number} is damaged: the replay cannot be resumed; start a new run."
+                    f"{self.path}, line {number} is damaged: go on with the episodes of the other lines by "
+                    "--replay.accept_loss=true, or start a new run."
                 ) from error
             if announced is not None and announced != rows:
                 yield announced, None
@@ -145,3 +191,5 @@ class Journal:
     def _append(self, entry: dict[str, Any]) -> None:
         with self.path.open("a") as file:
             file.write(json.dumps(entry) + "\n")
+            file.flush()
+            os.fsync(file.fileno())

@@ -23,6 +23,7 @@ __all__ = ["Arm", "state_names"]
 Array = NDArray[np.float64]
 TAKEN = 5  # tries for two readings of the leader that agree
 AT_HOME = 0.1  # share of the largest step within which the arm counts as being at home
+REST_S = 1.0  # without getting nearer: gravity, or an obstacle, keeps it from there
 
 
 def state_names(robot: Robot) -> list[str]:
@@ -60,6 +61,8 @@ class Arm:
         self._clutched = list(clutched)
         self._offset: Array | None = None
         self._states = state_names(guard.robot)
+        self._rested = 0  # control steps on the way home without getting nearer
+        self._at: tuple[Array, Array] = np.zeros(0), np.zeros(0)  # goal and joints before them
         if leader is not None:
             missing = [name for name in self.names if name not in leader.action_features]
             if missing:
@@ -145,16 +148,42 @@ class Arm:
 
     # -- home ------------------------------------------------------------------------------------------------
 
+    def set_off(self) -> None:
+        """A way home begins."""
+        self._rested = 0
+
     def step_home(self, may_move: Callable[[], bool]) -> bool:
-        """One control step towards home, at `home_speed`; whether the arm is there. Raises what `Guard.send` does."""
+        """One control step towards home, at `home_speed`; whether it is over. Raises what `Guard.send` does.
+
+        It is where the arm is at home, and where neither its goal nor its joints have come nearer for REST_S.
+        """
         if self.home is None:
             return True
-        way = self.home - self.guard.joints
+        joints, start = self.guard.joints, self.guard.goal
         near = AT_HOME * self.limits.max_step
-        if (np.abs(way) <= near).all():
+        if (np.abs(self.home - joints) <= near).all():
             self.guard.send(self.home, may_move)
             return True
         most = self.settings.home_speed * self.limits.max_speed / self.fps
-        start = self.guard.goal
-        self.guard.send(start + np.clip(self.home - start, -most, most), may_move)
-        return False
+        goal = self.guard.send(start + np.clip(self.home - start, -most, most), may_move)
+        if (
+            not self._rested
+            or (np.abs(goal - self._at[0]) > most / 2).any()
+            or (np.abs(joints - self._at[1]) > near).any()
+        ):
+            self._rested, self._at = 0, (goal, joints)
+        self._rested += 1
+        return self._rested > REST_S * self.fps
+
+    def short_of_home(self) -> str:
+        """A line where the arm rests more than a step from home; "" where it is there, but for what it sags."""
+        if self.home is None:
+            return ""
+        away = np.abs(self.home - self.guard.joints)
+        i = int(np.argmax(away / self.limits.max_step))
+        if away[i] <= self.limits.max_step[i]:
+            return ""
+        return (
+            f"The arm came to rest {away[i]:g} from home in '{self.names[i]}': is something in its way? Press home "
+            "again, or move it by hand."
+        )

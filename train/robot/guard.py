@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from lerobot_cqn.errors import CQNError
 
 from ..clock import REAL, Clock
+from .connection import connect, reconnect, reconnect_cameras
 from .limits import Limits, allowed_goal
-from .readings import Agreement, Contents, Reading, RobotFault, Whereabouts, WrongReadingError
+from .readings import Agreement, Contents, LostError, Reading, RobotFault, Whereabouts, WrongReadingError
 
 __all__ = ["Guard", "GuardSettings", "HeldError", "StoppedError"]
 
@@ -70,6 +71,8 @@ class Guard:
         self._whereabouts = Whereabouts(self.names, limits)
         self._measured: Array | None = None
         self._trusted = True  # whether the joints that were read last can be believed
+        self._lost = False  # whether the robot could not be read when it was to be taken up again
+        self._anew = False  # whether its motors were connected anew since the fault
         self._sent_at = self._asked_at = self._read_at = clock.now
         self._held, self._released = True, False
         self._changed_at: dict[str, float] = {}
@@ -90,13 +93,7 @@ class Guard:
 
         Raises RobotFault when the robot does not answer, or stands far outside the range of its limits.
         """
-        try:
-            if not self.robot.is_connected:
-                self.robot.connect()
-        except CQNError:
-            raise
-        except Exception as error:  # drivers raise many kinds
-            raise RobotFault(f"The robot cannot be connected: {error} Check cables, power and --robot.port.") from error
+        connect(self.robot)
         self._whereabouts.check_start(self.read().joints)
         self._watchdog = self._clock.thread(self._run, "watchdog")
         self._watchdog.start()
@@ -112,7 +109,7 @@ class Guard:
                 if release:
                     self.release()
             if self.robot.is_connected:
-                self.robot.disconnect()
+                self.robot.disconnect()  # its own way, which may switch the motors off
 
     # -- reading ---------------------------------------------------------------------------------------------
 
@@ -169,7 +166,7 @@ class Guard:
         try:
             raw = self.robot.get_observation()
         except Exception as error:  # drivers raise many kinds
-            raise RobotFault(f"The robot cannot be read: {error} Check cables and power.") from error
+            raise LostError(f"The robot cannot be read: {error} Check cables and power.") from error
         took = self._clock.now - begun
         if took > self.settings.current_s:
             raise RobotFault(f"Reading the robot took {took:.1f} s, expected at most {self.settings.current_s:g} s.")
@@ -307,19 +304,26 @@ class Guard:
             raise RobotFault(f"The motors cannot be switched {'on' if on else 'off'}: {error}") from error
 
     def recover(self) -> None:
-        """After a fault: connect again where the connection is gone, read until readings agree, hold.
+        """After a fault: read until readings agree, hold; call it again until it does not raise.
 
-        Motors that were connected throughout still go to the goal that they have, so the arm is held there, a step
-        nearer to where it reads at most. Raises RobotFault where it fails, or the arm is beyond its limits.
+        The second time that the robot cannot be read it is disconnected and connected. Motors that were connected
+        throughout still go to the goal that they have, so the arm is held there, a step nearer to where it reads at
+        most. An arm that a person moves by hand stays released. Raises RobotFault where it fails, or the arm is beyond
+        its limits.
         """
         with self._lock:
-            connected = self.robot.is_connected
+            if self._lost or not self.robot.is_connected:
+                if self._anew or not reconnect_cameras(self.robot):
+                    self._anew = True  # also where it fails half-way: the next time everything is connected again
+                    reconnect(self.robot)
+                if self._released:
+                    self._torque(on=False)  # drivers switch it on as they connect
             try:
-                if not connected:
-                    self.robot.connect()
-            except Exception as error:  # drivers raise many kinds
-                raise RobotFault(f"The robot cannot be connected: {error} Check cables and power.") from error
-            self._found(anew=not connected)
+                self._found(anew=self._anew)
+            except LostError:
+                self._lost = True
+                raise
+            self._lost = self._anew = False
             self._hold()
 
     def _found(self, *, anew: bool = True) -> None:

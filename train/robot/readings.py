@@ -12,7 +12,7 @@ from lerobot_cqn.errors import CQNError
 
 from .limits import Limits
 
-__all__ = ["Agreement", "Contents", "Reading", "RobotFault", "Whereabouts", "WrongReadingError"]
+__all__ = ["Agreement", "Contents", "LostError", "Reading", "RobotFault", "Whereabouts", "WrongReadingError"]
 
 Array = NDArray[np.float64]
 Pictures = Mapping[str, NDArray[np.uint8]]
@@ -25,6 +25,10 @@ class RobotFault(CQNError, RuntimeError):  # noqa: N818  # what people call it
 
     def __init__(self, text: str) -> None:
         super().__init__(" ".join(text.split()))  # drivers' errors have many lines
+
+
+class LostError(RobotFault):
+    """The driver says that the robot cannot be read: it is gone, or a part of it."""
 
 
 class WrongReadingError(RobotFault):

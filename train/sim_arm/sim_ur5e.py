@@ -49,6 +49,7 @@ class SimUR5e(Robot):
         self.config = config
         self.cameras = dict.fromkeys(config.camera_names)  # lerobot-record counts them
         self._world: World | None = None
+        self._left: World | None = None  # that it stood in when it was disconnected
         self._person: SimPerson | None = None
         self._last: dict[str, Any] = {}
         self._rng = np.random.default_rng(config.seed)
@@ -83,14 +84,24 @@ class SimUR5e(Robot):
         return True
 
     def connect(self, calibrate: bool = True) -> None:
-        """Start the world. Raises DeviceAlreadyConnectedError the second time, ConfigError for a name that is taken."""
+        """Start the world, or find the arm as it was left.
+
+        Raises DeviceAlreadyConnectedError the second time, ConfigError for a name that is taken, and what faults raise.
+        """
         del calibrate
         if self.is_connected:
             raise DeviceAlreadyConnectedError(f"{self} is connected already.")
         c = self.config
         if c.world in WORLDS:
             raise ConfigError(f"There is an arm in the world '{c.world}' already: give another --robot.world.")
-        self._world = WORLDS[c.world] = World(c.task, c.speed, c.ramp_s, c.seed, self.clock)
+        if self._left is not None:  # its motors hold while nobody is connected
+            self._left.catch_up()
+            if any(fault.kind == "disconnect" and fault.active(self._left.now) for fault in c.faults):
+                raise ConnectionError(f"{self}: injected fault 'disconnect'.")
+            self._left.open()
+        world = self._left or World(c.task, c.speed, c.ramp_s, c.seed, self.clock)
+        self._world, self._left = world, None
+        WORLDS[c.world] = world
         if c.person:
             self._person = SimPerson(self._world, c.person, c.person_takes_over_s, c.person_helps_episodes)
             self._person.start()
@@ -140,7 +151,7 @@ class SimUR5e(Robot):
             self._person.close()
         self.world.close()
         WORLDS.pop(self.config.world, None)
-        self._world = None
+        self._world, self._left = None, self._world
 
     def _object_names(self) -> tuple[str, ...]:
         # lerobot-rollout hands on what is called a position or a speed, and nothing else.

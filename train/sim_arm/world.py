@@ -90,8 +90,12 @@ class World:
         with self.lock:
             return self.arm.tip_at(joints)
 
+    def open(self) -> None:
+        """Draw again, after `close`."""
+        self._painter = ThreadPoolExecutor(1, "painter")
+
     def close(self) -> None:
-        """Free the graphics."""
+        """Free the graphics; the arm stays as it is."""
         self._painter.submit(self._cameras.close).result()
         self._painter.shutdown()
 

@@ -1,0 +1,67 @@
+"""Connecting a robot again after a part of it was gone; LeRobot's drivers only know all or nothing."""
+
+import contextlib
+from typing import Any
+
+from lerobot.robots.robot import Robot
+
+from .readings import RobotFault
+
+__all__ = ["connect", "reconnect", "reconnect_cameras"]
+
+
+def connect(robot: Robot) -> None:
+    """Connect a robot that is not. Raises RobotFault where it does not answer."""
+    try:
+        if not robot.is_connected:
+            robot.connect()
+    except Exception as error:  # drivers raise many kinds
+        raise RobotFault(f"The robot cannot be connected: {error} Check cables, power and --robot.port.") from error
+
+
+def reconnect_cameras(robot: Robot) -> bool:
+    """Connect the cameras that are gone, where the motors are not; whether there was such a camera.
+
+    Raises RobotFault where one does not answer.
+    """
+    gone = [camera for camera in _cameras(robot) if not camera.is_connected]
+    if not gone or not _connected(getattr(robot, "bus", None)):
+        return False
+    try:
+        for camera in gone:
+            with contextlib.suppress(Exception):  # what is left of its thread
+                camera.disconnect()
+            camera.connect()
+    except Exception as error:  # drivers raise many kinds
+        raise RobotFault(f"A camera cannot be connected: {error} Check its cable.") from error
+    return True
+
+
+def reconnect(robot: Robot) -> None:
+    """Disconnect every part and connect, whatever the driver says. Raises RobotFault where it does not answer."""
+    _disconnect(robot)
+    connect(robot)
+
+
+def _disconnect(robot: Robot) -> None:
+    """Close every part that is open, whatever fails, and leave the motors as they are: a limp arm falls."""
+    bus = getattr(robot, "bus", None)
+    if _connected(bus):
+        with contextlib.suppress(Exception):
+            bus.disconnect(disable_torque=False)  # type: ignore[union-attr]  # it is connected
+    for camera in _cameras(robot):
+        with contextlib.suppress(Exception):
+            camera.disconnect()
+    with contextlib.suppress(Exception):
+        if robot.is_connected:
+            robot.disconnect()
+
+
+def _cameras(robot: Robot) -> list[Any]:
+    """Cameras that can be connected one by one, as LeRobot's own robots have them."""
+    cameras = getattr(robot, "cameras", None)
+    return [one for one in cameras.values() if hasattr(one, "is_connected")] if isinstance(cameras, dict) else []
+
+
+def _connected(bus: Any) -> bool:
+    return bool(getattr(bus, "is_connected", False))
