@@ -18,6 +18,7 @@ from ..decisions.angles import full_turn, turned
 from ..decisions.joints import gripper_dims, rate_dims
 from ..decisions.pause_threshold import Motion, Suggestion
 from ..decisions.pauses import DRIVES, drives, pause_runs
+from ..decisions.rewards import demonstration_end
 from ..disk.source import Source
 from ..views.episode import Episode
 from .action_lag import Follow
@@ -59,6 +60,8 @@ class EpisodeNumbers:
         runs: (first step, length) of the pauses; of the first episodes only.
         gripper_events: how often the gripper opens or closes; None without a gripper.
         first_reward: frame of the first positive reward; None where there is none.
+        end: last frame of the demonstration, as cqn-train takes it.
+        dense: share of the frames up to there with a reward other than 0, [0, 1].
         success: whether it succeeded; None where the dataset does not say.
     """
 
@@ -67,6 +70,8 @@ class EpisodeNumbers:
     jitter: float
     digest: str
     first_reward: int | None = None
+    end: int | None = None
+    dense: float = 0.0
     success: bool | None = None
     still: float = 0.0
     still_start: int = 0
@@ -103,7 +108,10 @@ class Dimension:
 
 @dataclass
 class Numbers:
-    """Everything measured; episodes that cannot be read are in ``bad`` with the reason."""
+    """Everything measured; episodes that cannot be read are in ``bad`` with the reason.
+
+    ``rewarded`` and ``judged``: whether there is a column of rewards, of successes.
+    """
 
     episodes: list[EpisodeNumbers] = field(default_factory=list)
     bad: dict[int, str] = field(default_factory=dict)
@@ -113,6 +121,7 @@ class Numbers:
     jump_count: int = 0
     tasks: dict[str, int] = field(default_factory=dict)
     rewarded: bool = False
+    judged: bool = False
     follow: Follow | None = None
 
     @property
@@ -132,7 +141,7 @@ def measure(source: Source, advance: Callable[[], None] = lambda: None) -> Numbe
         source: an opened dataset.
         advance: called after each episode of each round.
     """
-    numbers = Numbers(rewarded=NEXT_REWARD in source.features)
+    numbers = Numbers(rewarded=NEXT_REWARD in source.features, judged=NEXT_SUCCESS in source.features)
     for column in (STATE, ACTION):
         if column in source.features:
             names = dimension_names(source.features[column])
@@ -194,6 +203,9 @@ def _first_look(source: Source, episode: Episode, numbers: Numbers) -> None:
         summary.success = bool(len(paid))
     if NEXT_SUCCESS in episode.columns:
         summary.success = bool(np.asarray(episode.columns[NEXT_SUCCESS], bool).any())
+    summary.end, _ = demonstration_end(episode.columns, len(episode))
+    if NEXT_REWARD in episode.columns:
+        summary.dense = float((_vectors(episode, NEXT_REWARD)[: summary.end + 1, 0] != 0).mean())
     numbers.episodes.append(summary)
 
 
