@@ -20,6 +20,7 @@ from .decoded import Decoded
 from .rewrite import all_features, rewrite, traced_columns, write_bounds
 from .source import Source
 from .target import Target, new_dataset, skip_entry, write_history
+from .timing import TOLERANCE
 
 __all__ = ["Written", "pictures_unchanged", "write"]
 
@@ -66,19 +67,31 @@ def write(
     empty = [i for i, n in lengths.items() if n == 0]
     if empty:
         raise DataError(f"Nothing would be left of episode {', '.join(map(str, empty[:5]))}; drop it instead.")
-    if pictures_unchanged(view, source):
-        rewrite(view, source, root, bar)
-        return Written(len(lengths), sum(lengths.values()), copied=bool(source.meta.video_keys))
+    try:
+        if pictures_unchanged(view, source):
+            rewrite(view, source, root, bar)
+            return Written(len(lengths), sum(lengths.values()), copied=bool(source.meta.video_keys))
+    except DataError:
+        if not skip:
+            raise
+        note("Some videos cannot be copied as they are: what can be read of them is encoded anew.")
     return _encode(view, source, repo_id, root, bar, lengths, skip=skip, crf=crf)
 
 
 def pictures_unchanged(view: View, source: Source) -> bool:
-    """Whether every frame of every episode stays, as it is and where it is."""
+    """Whether every frame of every episode stays, as it is and where it is, and LeRobot finds it there."""
     if view.cameras != source.cameras or view.fps != source.fps:
         return False
     if list(view.episodes) != list(source.episodes):
         return False
-    return all(len(view.episode(i)) == len(source.episode(i)) for i in view.episodes)
+    if not all(len(view.episode(i)) == len(source.episode(i)) for i in view.episodes):
+        return False
+    apart = max((source.drift(i, source.episode(i).times) for i in source.episodes), default=0.0)
+    if apart > TOLERANCE:
+        note(
+            f"Rows and pictures are up to {1000 * apart:.3g} ms apart, which LeRobot refuses: videos are encoded anew."
+        )
+    return apart <= TOLERANCE
 
 
 def _encode(

@@ -106,7 +106,9 @@ def _write_numbers(view: View, source: Source, folder: Path, bar: Progress) -> d
     line = bar.add_task("Writing episodes", total=len(view.episodes))
     for path, episodes in _partition(source):
         columns: dict[str, list[Any]] = {k: [] for k in numbers}
+        times: list[float] = []
         for index in episodes:
+            times.extend(view.episode(index).times)
             own = traced_columns(view, index)
             flat = {k: v.reshape(len(v)) if f["shape"] == (1,) and f["dtype"] != "string" else v
                     for (k, f), v in ((item, own[item[0]]) for item in numbers.items())}  # fmt: skip
@@ -119,7 +121,8 @@ def _write_numbers(view: View, source: Source, folder: Path, bar: Progress) -> d
         old = pq.read_table(source.root / path)
         if len(old) != len(table):
             raise DataError(f"{source.root / path} holds {len(old)} frames, its episodes {len(table)}; it is damaged.")
-        arrays = [table[k] if k in numbers else old[k] for k in schema]
+        fresh_columns = {k: table[k] for k in numbers} | {"timestamp": pa.array(times, pa.float32())}
+        arrays = [fresh_columns[k] if k in fresh_columns else old[k] for k in schema]
         target = folder / path
         target.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(pa.table(arrays, schema=schema.arrow_schema), target, compression="snappy")

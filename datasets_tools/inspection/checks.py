@@ -40,7 +40,7 @@ class Dataset:
     """Metadata: frames a second, columns, whether its history calls the actions differences."""
 
     repo_id: str
-    fps: int
+    fps: float
     columns: Sequence[str]
     episodes: int
     deltas: bool

@@ -129,6 +129,7 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
     from .finding import by_level
     from .numbers import measure
     from .statistics import statistics
+    from .timing import timing
 
     missing = missing_videos(source)
     with progress() as bar:
@@ -150,8 +151,12 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
     except Exception:  # a damaged history is not what is inspected here
         deltas = False
     dataset = Dataset(repo_id, source.fps, list(source.features), len(source.episodes), deltas)
-    found = sorted([*findings(dataset, numbers, cameras, missing), *statistics(source, numbers)], key=by_level)
-    return Inspection(found, dataset, numbers, cameras)
+    found = [
+        *findings(dataset, numbers, cameras, missing),
+        *statistics(source, numbers),
+        *timing(source, numbers),
+    ]
+    return Inspection(sorted(found, key=by_level), dataset, numbers, cameras)
 
 
 def _write_page(path: Path, inspection: Inspection) -> None:

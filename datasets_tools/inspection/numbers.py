@@ -195,7 +195,7 @@ def _first_look(source: Source, episode: Episode, numbers: Numbers) -> None:
         numbers.follow.add(_vectors(episode, ACTION), _vectors(episode, STATE))
     for task in episode.tasks:
         numbers.tasks[task] = numbers.tasks.get(task, 0) + 1
-    uneven = np.abs(np.diff(episode.times) * source.fps - 1)
+    uneven = np.abs(np.diff(source.recorded_times(episode.index)) * source.fps - 1)
     summary = EpisodeNumbers(episode.index, len(episode), float(uneven.max(initial=0.0)), _digest(episode))
     if NEXT_REWARD in episode.columns:
         paid = np.flatnonzero(_vectors(episode, NEXT_REWARD)[:, 0] > 0)
