@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from lerobot_cqn.errors import DataError
 
 from ..views.episode import Bounds, Camera, Episode
 from ..views.view import View
-from .columns import read_column, refuse_uneven
+from .columns import places, read_column, refuse_disorder, refuse_uneven, tasks_by_index
 from .decoded import Colours, Decoded
 from .folders import local_root
 from .pictures import picture_size, shaped, video_pictures
@@ -31,7 +32,13 @@ NOT_NUMBERS = ("image", "video", "language")  # what an episode does not hold in
 
 
 class Source(View):
-    """A dataset on disk, opened by :func:`open_source`; episodes are read one at a time."""
+    """A dataset on disk, opened by :func:`open_source`; episodes are read one at a time.
+
+    Attributes:
+        meta: LeRobot's metadata.
+        root: its folder.
+        tasks: sentence of each task_index.
+    """
 
     def __init__(self, meta: LeRobotDatasetMetadata, root: Path) -> None:
         self.meta = meta
@@ -42,10 +49,19 @@ class Source(View):
         self._cached_bytes = 0
         self._picture_times: dict[Path, NDArray[np.float64]] = {}
         self._colours: dict[str, tuple[Path, Colours]] = {}
+        self._places = places(np.asarray(self.rows.data.column("episode_index").to_numpy()))
+        self.tasks = tasks_by_index(root, meta.tasks)
         if len(self.rows) != meta.total_frames:
             raise DataError(
                 f"{root}: meta/info.json declares {meta.total_frames} frames, the parquet files hold"
                 f" {len(self.rows)}; record or download the dataset again."
+            )
+        listed = [int(i) for i in meta.episodes["episode_index"]]
+        if listed != list(range(meta.total_episodes)):
+            lacking = [i for i in range(max(listed, default=0)) if i not in set(listed)][:8]
+            raise DataError(
+                f"{root}: meta/episodes lists {len(listed)} episodes out of order or with gaps (lacking"
+                f" {', '.join(map(str, lacking)) or 'none'}); restore them, and leave episodes out with cqn-data drop."
             )
 
     @property
@@ -123,31 +139,58 @@ class Source(View):
         """
         if index in self._cache:
             return self._cache[index]
-        row = self.meta.episodes[index]
-        start, stop = int(row["dataset_from_index"]), int(row["dataset_to_index"])
-        table = self._arrow[start:stop]
-        if stop <= start or set(table["episode_index"].to_pylist()) != {index}:
-            raise DataError(f"{self.root}: rows {start}:{stop} are not those of episode {index}; the index is damaged.")
+        table = self.table(index)
+        refuse_disorder(index, np.asarray(table["frame_index"].to_numpy()))
         recorded = np.asarray(table["timestamp"].to_numpy(), dtype=np.float64)
         refuse_uneven(index, recorded, self.fps)
         columns: dict[str, Any] = {}
         for key, feature in self.features.items():
             if feature["dtype"] not in NOT_NUMBERS:
                 columns[key] = read_column(index, key, feature, table[key])
-        names = self.meta.tasks.index
-        tasks = [str(names[i]) for i in table["task_index"].to_pylist()]
+        tasks = [self._task(index, number) for number in table["task_index"].to_pylist()]
         frames = np.arange(len(tasks), dtype=np.int64)
         # Where there are as many pictures as rows they belong to one another in order, whatever a clock said.
         times = frames / self.fps if self._pictures_in(index) in (None, len(tasks)) else recorded
-        episode = Episode(index, start, frames, times, columns, tasks)
+        episode = Episode(index, self._places[index][0], frames, times, columns, tasks)
         self._remember(episode)
         return episode
 
     def recorded_times(self, index: int) -> NDArray[np.float64]:
         """(T,) time stamps of an episode as they are in the table, which LeRobot's loader takes, in seconds."""
-        row = self.meta.episodes[index]
-        table = self._arrow[int(row["dataset_from_index"]) : int(row["dataset_to_index"])]
-        return np.asarray(table["timestamp"].to_numpy(), dtype=np.float64)
+        return np.asarray(self.table(index)["timestamp"].to_numpy(), dtype=np.float64)
+
+    def table(self, index: int) -> Any:
+        """Rows of an episode as an Arrow table, wherever they lie in the data files.
+
+        Raises:
+            DataError: they are not as many as its metadata says, or lie in several places.
+        """
+        length, (start, stop) = int(self.meta.episodes[index]["length"]), self._places.get(index, (0, 0))
+        if stop - start != length or length < 1:
+            raise DataError(
+                f"{self.root}: meta/episodes says that episode {index} has {length} rows, the data files hold"
+                f" {stop - start} of it in one piece; the index is damaged, or the episode empty: drop it."
+            )
+        return self._arrow[start:stop]
+
+    @cached_property
+    def in_order(self) -> bool:
+        """Whether rows, their numbers and tasks are where LeRobot looks for them: by their place, from 0."""
+        starts = [self._places.get(i, (-1, 0))[0] for i in self.episodes]
+        numbers = np.asarray(self.rows.data.column("index").to_numpy())
+        return (
+            starts == [int(start) for start in self.meta.episodes["dataset_from_index"]]
+            and starts == sorted(starts)
+            and bool((numbers == np.arange(len(numbers))).all())
+            and list(self.tasks) == list(range(len(self.tasks)))
+        )
+
+    def _task(self, index: int, number: int) -> str:
+        if number not in self.tasks:
+            raise DataError(
+                f"Episode {index}: task_index {number} is not in {self.root}/meta/tasks.parquet; add it there."
+            )
+        return self.tasks[number]
 
     def drift(self, index: int, times: NDArray[np.float64]) -> float:
         """Largest distance, in seconds, between rows of an episode that lie at (T,) ``times`` in it and their pictures.

@@ -128,8 +128,8 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
     from .checks import Dataset, findings
     from .finding import by_level
     from .numbers import measure
+    from .places import order, timing
     from .statistics import statistics
-    from .timing import timing
 
     missing = missing_videos(source)
     with progress() as bar:
@@ -154,6 +154,7 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
     found = [
         *findings(dataset, numbers, cameras, missing),
         *statistics(source, numbers),
+        *order(source),
         *timing(source, numbers),
     ]
     return Inspection(sorted(found, key=by_level), dataset, numbers, cameras)

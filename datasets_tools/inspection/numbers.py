@@ -19,6 +19,7 @@ from ..decisions.joints import gripper_dims, rate_dims
 from ..decisions.pause_threshold import Motion, Suggestion
 from ..decisions.pauses import DRIVES, drives, pause_runs
 from ..decisions.rewards import demonstration_end
+from ..disk.columns import refuse_infinite
 from ..disk.source import Source
 from ..views.episode import Episode
 from .action_lag import Follow
@@ -110,7 +111,8 @@ class Dimension:
 class Numbers:
     """Everything measured; episodes that cannot be read are in ``bad`` with the reason.
 
-    ``rewarded`` and ``judged``: whether there is a column of rewards, of successes.
+    ``rewarded`` and ``judged``: whether there is a column of rewards, of successes; ``infinite``: the first episode and
+    frame of columns that training does not read and that are not finite.
     """
 
     episodes: list[EpisodeNumbers] = field(default_factory=list)
@@ -123,6 +125,7 @@ class Numbers:
     rewarded: bool = False
     judged: bool = False
     follow: Follow | None = None
+    infinite: dict[str, tuple[int, int]] = field(default_factory=dict)
 
     @property
     def steps(self) -> int:
@@ -173,6 +176,7 @@ def _readable(source: Source, numbers: Numbers, advance: Callable[[], None]) -> 
     for index in source.episodes:
         try:
             episode = source.episode(index)
+            refuse_infinite(episode)
         except DataError as error:
             numbers.bad[index] = str(error)
         else:
@@ -195,6 +199,11 @@ def _first_look(source: Source, episode: Episode, numbers: Numbers) -> None:
         numbers.follow.add(_vectors(episode, ACTION), _vectors(episode, STATE))
     for task in episode.tasks:
         numbers.tasks[task] = numbers.tasks.get(task, 0) + 1
+    for key, values in episode.columns.items():
+        if key not in numbers.infinite and np.issubdtype(np.asarray(values).dtype, np.floating):
+            bad = np.flatnonzero(~np.isfinite(_vectors(episode, key)).all(axis=1))
+            if len(bad):
+                numbers.infinite[key] = (episode.index, int(bad[0]))
     uneven = np.abs(np.diff(source.recorded_times(episode.index)) * source.fps - 1)
     summary = EpisodeNumbers(episode.index, len(episode), float(uneven.max(initial=0.0)), _digest(episode))
     if NEXT_REWARD in episode.columns:

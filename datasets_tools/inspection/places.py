@@ -1,4 +1,4 @@
-"""Judgements of ``cqn-data inspect`` on time: whether each row has its picture where LeRobot's loader looks for it."""
+"""Judgements of ``cqn-data inspect`` on places: whether rows, tasks and pictures lie where LeRobot looks for them."""
 
 from collections.abc import Iterator
 
@@ -11,7 +11,15 @@ from ..disk.timing import TOLERANCE
 from .finding import NAMED, Finding, episodes_text, more
 from .numbers import Numbers
 
-__all__ = ["timing"]
+__all__ = ["order", "timing"]
+
+
+def order(source: Source) -> Iterator[Finding]:
+    """Rows, numbers and tasks that do not lie where LeRobot looks for them."""
+    if not source.in_order:
+        text = "Rows, their numbers or the tasks do not lie in order from 0; LeRobot finds them by their place."
+        advice = "Any operation of cqn-data (label, bounds, filter, …) writes them anew, in order."
+        yield Finding("error", "order", "data, meta/tasks.parquet", text, advice)
 
 
 def timing(source: Source, numbers: Numbers) -> Iterator[Finding]:
