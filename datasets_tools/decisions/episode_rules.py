@@ -52,7 +52,7 @@ class Rule:
     compare: str
     value: float
 
-    def quantity(self, columns: Mapping[str, Any], steps: int, fps: int) -> float:
+    def quantity(self, columns: Mapping[str, Any], steps: int, fps: float) -> float:
         """The number that the rule compares.
 
         Args:
@@ -72,7 +72,7 @@ class Rule:
         chosen = OVER[self.over](values)
         return float(chosen.max() if self.dim is None else chosen[self.dim])
 
-    def holds(self, columns: Mapping[str, Any], steps: int, fps: int) -> bool:
+    def holds(self, columns: Mapping[str, Any], steps: int, fps: float) -> bool:
         """Whether an episode fulfils the rule; arguments as of :meth:`quantity`."""
         return COMPARE[self.compare](self.quantity(columns, steps, fps), self.value)
 

@@ -1,12 +1,14 @@
 """Write a view as a new dataset: pictures decoded once and encoded once, or not touched at all where none changes."""
 
 import dataclasses
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets.compute_stats import sample_indices
 from rich.progress import Progress
@@ -18,8 +20,9 @@ from ..views.episode import Camera
 from ..views.view import View
 from .decoded import Decoded
 from .rewrite import all_features, rewrite, traced_columns, write_bounds
-from .source import Source
+from .source import NOT_NUMBERS, Source
 from .target import Target, new_dataset, skip_entry, write_history
+from .timing import TOLERANCE
 
 __all__ = ["Written", "pictures_unchanged", "write"]
 
@@ -66,19 +69,38 @@ def write(
     empty = [i for i, n in lengths.items() if n == 0]
     if empty:
         raise DataError(f"Nothing would be left of episode {', '.join(map(str, empty[:5]))}; drop it instead.")
-    if pictures_unchanged(view, source):
-        rewrite(view, source, root, bar)
-        return Written(len(lengths), sum(lengths.values()), copied=bool(source.meta.video_keys))
+    single = [i for i, n in lengths.items() if n == 1]
+    tables = [k for k, f in view.features.items() if f["dtype"] not in NOT_NUMBERS and len(f["shape"]) > 1]
+    if single and tables:
+        raise DataError(
+            f"Episode {single[0]} has one step, of which LeRobot cannot keep statistics of '{tables[0]}'"
+            f" {tuple(view.features[tables[0]]['shape'])}; leave such episodes out: cqn-data drop --where='steps < 2'."
+        )
+    try:
+        if pictures_unchanged(view, source):
+            rewrite(view, source, root, bar)
+            return Written(len(lengths), sum(lengths.values()), copied=bool(source.meta.video_keys))
+    except DataError:
+        if not skip:
+            raise
+        note("Some videos cannot be copied as they are: what can be read of them is encoded anew.")
     return _encode(view, source, repo_id, root, bar, lengths, skip=skip, crf=crf)
 
 
 def pictures_unchanged(view: View, source: Source) -> bool:
-    """Whether every frame of every episode stays, as it is and where it is."""
+    """Whether every frame of every episode stays, as it is and where it is, and LeRobot finds it there."""
     if view.cameras != source.cameras or view.fps != source.fps:
         return False
     if list(view.episodes) != list(source.episodes):
         return False
-    return all(len(view.episode(i)) == len(source.episode(i)) for i in view.episodes)
+    if not all(len(view.episode(i)) == len(source.episode(i)) for i in view.episodes):
+        return False
+    apart = max((source.drift(i, source.episode(i).times) for i in source.episodes), default=0.0)
+    if apart > TOLERANCE:
+        note(
+            f"Rows and pictures are up to {1000 * apart:.3g} ms apart, which LeRobot refuses: videos are encoded anew."
+        )
+    return apart <= TOLERANCE
 
 
 def _encode(
@@ -119,6 +141,8 @@ def _encode(
         if not kept:
             raise DataError(f"Not one episode could be read; the last one: {done.skipped[max(done.skipped)]}")
         _finish(view, target, kept, done)
+        for table in _side_tables(source):
+            shutil.copyfile(table, target.folder / "meta" / table.name)
     done.episodes, done.frames = len(kept), sum(lengths[i] for i in kept)
     return done
 
@@ -183,9 +207,16 @@ def _codec(info: dict[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in info.items() if k not in ("video.height", "video.width", "video.fps")}
 
 
+def _side_tables(source: Source) -> list[Path]:
+    """Tables in ``meta/`` that are of the whole dataset, such as ``subtasks.parquet``, not of its episodes."""
+    tables = [p for p in sorted((source.root / "meta").glob("*.parquet")) if p.name not in KNOWN_META]
+    return [p for p in tables if not {"episode_index", "frame_index", "index"} & set(pq.read_schema(p).names)]
+
+
 def _note_losses(source: Source) -> None:
     """Name what LeRobot's writer does not know and hence cannot write."""
-    files = [p.name for p in sorted((source.root / "meta").iterdir()) if p.name not in KNOWN_META]
+    carried = {*KNOWN_META, *(p.name for p in _side_tables(source))}
+    files = [p.name for p in sorted((source.root / "meta").iterdir()) if p.name not in carried]
     if files:
         note(f"Not carried over, since their meaning is unknown: meta/{', meta/'.join(files)}.")
     own = ("videos/", "data/", "meta/", "stats/", "dataset_", "episode_index", "tasks", "length")

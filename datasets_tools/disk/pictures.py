@@ -28,7 +28,7 @@ def picture_size(feature: dict[str, Any]) -> tuple[int, int]:
 
 
 def video_pictures(
-    path: Path, times: NDArray[np.float64], fps: int, episode: int, frames: NDArray[np.int64]
+    path: Path, times: NDArray[np.float64], fps: float, episode: int, frames: NDArray[np.int64]
 ) -> Iterator[Decoded]:
     """Yield the pictures nearest to ascending ``times`` from front to back, without going back in the file.
 

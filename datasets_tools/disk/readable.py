@@ -10,6 +10,7 @@ from lerobot_cqn.errors import DataError
 from ..decisions.joints import match_joints
 from ..terminal.console import note
 from ..views.view import DerivedView
+from .columns import refuse_infinite
 from .source import Source
 from .target import skip_entry
 
@@ -49,7 +50,9 @@ def readable(source: Source, actions: str, *, skip_bad_episodes: bool, needs_vid
     bad: dict[int, str] = {}
     for index in source.episodes:
         try:
-            source.episode(index)
+            episode = source.episode(index)
+            if skip_bad_episodes:  # else where a step reads them: rows that trim or drop leave out do not matter
+                refuse_infinite(episode)
             if needs_videos:
                 source.check_videos([index])
         except DataError as error:

@@ -1,5 +1,6 @@
 """Write a view whose pictures do not change: videos copied byte by byte, only numbers and their statistics anew."""
 
+import itertools
 import json
 import shutil
 from collections.abc import Iterator
@@ -15,8 +16,6 @@ from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import write_stats
 from rich.progress import Progress
 
-from lerobot_cqn.errors import DataError
-
 from ..views.episode import SOURCE_EPISODE, SOURCE_FRAME, Bounds
 from ..views.view import View
 from .folders import new_folder
@@ -26,9 +25,10 @@ from .target import write_history
 __all__ = ["INDEX", "all_features", "rewrite", "traced_columns", "write_bounds"]
 
 INDEX: dict[str, Any] = {"dtype": "int64", "shape": (1,), "names": None}
-ANEW = ("data", "meta/info.json", "meta/stats.json", "meta/episodes", "meta/cqn_history.json")
+ANEW = ("data", "meta/info.json", "meta/tasks.parquet", "meta/stats.json", "meta/episodes", "meta/cqn_history.json")
 
 type Stats = dict[str, dict[str, Any]]
+type Places = dict[int, dict[str, int]]
 
 
 def all_features(view: View) -> dict[str, dict[str, Any]]:
@@ -53,8 +53,9 @@ def rewrite(view: View, source: Source, root: Path, bar: Progress) -> None:
     _refuse_cut_videos(source)
     with new_folder(root) as folder:
         _copy_rest(source.root, folder, bar)
-        stats = _write_numbers(view, source, folder, bar)
-        _write_episodes(source, folder, stats)
+        stats, places = _write_numbers(view, source, folder, bar)
+        _write_episodes(source, folder, stats, places)
+        _write_tasks(source, folder)
         known = source.meta.stats or _from_episodes(source)
         old = {k: v for k, v in known.items() if k in view.features or "." not in k}
         write_stats({**old, **aggregate_stats(list(stats.values()))}, folder)
@@ -97,56 +98,78 @@ def _copy_rest(source: Path, folder: Path, bar: Progress) -> None:
         shutil.copyfile(path, copy)
 
 
-def _write_numbers(view: View, source: Source, folder: Path, bar: Progress) -> dict[int, Stats]:
-    """The data files, in the source's own partition; returns each episode's statistics of the numbers."""
+def _write_numbers(view: View, source: Source, folder: Path, bar: Progress) -> tuple[dict[int, Stats], Places]:
+    """The data files, in the source's own partition where that is in order.
+
+    Returns:
+        each episode's statistics of the numbers, and where it lies: columns of ``meta/episodes``.
+    """
     features = {**source.meta.features, **all_features(view)}
     schema = get_hf_features_from_features(features)
     numbers = {k: f for k, f in all_features(view).items() if f["dtype"] not in NOT_NUMBERS}
+    tasks = {number: place for place, number in enumerate(sorted(source.tasks))}
     stats: dict[int, Stats] = {}
+    places: Places = {}
+    written = 0
     line = bar.add_task("Writing episodes", total=len(view.episodes))
-    for path, episodes in _partition(source):
+    for file, (path, episodes) in enumerate(_partition(source)):
         columns: dict[str, list[Any]] = {k: [] for k in numbers}
+        times: list[float] = []
+        chunk, number = divmod(file, source.meta.chunks_size)
+        target = path if source.in_order else Path(source.meta.data_path.format(chunk_index=chunk, file_index=number))
         for index in episodes:
+            times.extend(view.episode(index).times)
             own = traced_columns(view, index)
             flat = {k: v.reshape(len(v)) if f["shape"] == (1,) and f["dtype"] != "string" else v
                     for (k, f), v in ((item, own[item[0]]) for item in numbers.items())}  # fmt: skip
             stats[index] = compute_episode_stats(flat, numbers)
             for key, values in flat.items():
                 columns[key].extend(values)
+            stop = written + len(times)
+            places[index] = {"dataset_from_index": stop - len(view.episode(index)), "dataset_to_index": stop}
+            if not source.in_order:
+                places[index] |= {"data/chunk_index": chunk, "data/file_index": number}
             bar.advance(line)
         fresh = datasets.Dataset.from_dict(columns, features=datasets.Features({k: schema[k] for k in numbers}))
-        table = fresh.with_format("arrow")[:]
-        old = pq.read_table(source.root / path)
-        if len(old) != len(table):
-            raise DataError(f"{source.root / path} holds {len(old)} frames, its episodes {len(table)}; it is damaged.")
-        arrays = [table[k] if k in numbers else old[k] for k in schema]
-        target = folder / path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(pa.table(arrays, schema=schema.arrow_schema), target, compression="snappy")
-    return stats
+        table, old = fresh.with_format("arrow")[:], pa.concat_tables([source.table(index) for index in episodes])
+        new = {k: table[k] for k in numbers} | {
+            "timestamp": pa.array(times, pa.float32()),
+            "index": pa.array(range(written, written + len(times)), pa.int64()),
+            "task_index": pa.array([tasks[n] for n in old["task_index"].to_pylist()], pa.int64()),
+        }
+        arrays = [new[k] if k in new else old[k] for k in schema]
+        written += len(times)
+        (folder / target).parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.table(arrays, schema=schema.arrow_schema), folder / target, compression="snappy")
+    return stats, places
 
 
 def _partition(source: Source) -> Iterator[tuple[Path, list[int]]]:
-    """Data files with their episodes, in order."""
-    files: dict[Path, list[int]] = {}
-    for index in source.episodes:
-        files.setdefault(Path(source.meta.get_data_file_path(index)), []).append(index)
-    yield from files.items()
+    """Data files with their episodes, in order; a file whose episodes lie apart comes several times."""
+    for path, episodes in itertools.groupby(source.episodes, lambda i: Path(source.meta.get_data_file_path(i))):
+        yield path, list(episodes)
 
 
-def _write_episodes(source: Source, folder: Path, stats: dict[int, Stats]) -> None:
-    """The episodes' metadata with the new statistics; all other columns stay."""
+def _write_tasks(source: Source, folder: Path) -> None:
+    """The tasks by their number, from 0: LeRobot takes the one in that place of the table."""
+    ordered = source.meta.tasks.sort_values("task_index")
+    ordered["task_index"] = range(len(ordered))
+    ordered.to_parquet(folder / "meta/tasks.parquet")
+
+
+def _write_episodes(source: Source, folder: Path, stats: dict[int, Stats], places: Places) -> None:
+    """The episodes' metadata with the new statistics and places; all other columns stay."""
     for path in sorted((source.root / "meta/episodes").rglob("*.parquet")):
         table = pq.read_table(path)
-        rows = [stats[i] for i in table["episode_index"].to_pylist()]
-        for key in rows[0]:
-            for name in rows[0][key]:
-                values = pa.array([np.asarray(row[key][name]).tolist() for row in rows])
-                column = f"stats/{key}/{name}"
-                if column in table.column_names:
-                    table = table.set_column(table.column_names.index(column), column, values)
-                else:
-                    table = table.append_column(column, values)
+        numbers = table["episode_index"].to_pylist()
+        new = {f"stats/{key}/{name}": [np.asarray(stats[i][key][name]).tolist() for i in numbers]
+               for key, kinds in stats[numbers[0]].items() for name in kinds}  # fmt: skip
+        new |= {name: [places[i][name] for i in numbers] for name in places[numbers[0]]}
+        for name, values in new.items():
+            if name in table.column_names:
+                table = table.set_column(table.column_names.index(name), name, pa.array(values))
+            else:
+                table = table.append_column(name, pa.array(values))
         target = folder / path.relative_to(source.root)
         target.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(table, target)

@@ -2,11 +2,11 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import load_nested_dataset
@@ -18,20 +18,27 @@ from lerobot_cqn.errors import DataError
 
 from ..views.episode import Bounds, Camera, Episode
 from ..views.view import View
+from .columns import places, read_column, refuse_disorder, refuse_uneven, tasks_by_index
 from .decoded import Colours, Decoded
 from .folders import local_root
 from .pictures import picture_size, shaped, video_pictures
 from .target import read_history
+from .timing import distances, picture_times
 
 __all__ = ["Source", "open_source"]
 
 CACHE_BYTES = 256 * 2**20
 NOT_NUMBERS = ("image", "video", "language")  # what an episode does not hold in memory
-JITTER = 0.2  # share of a step by which a timestamp may be off
 
 
 class Source(View):
-    """A dataset on disk, opened by :func:`open_source`; episodes are read one at a time."""
+    """A dataset on disk, opened by :func:`open_source`; episodes are read one at a time.
+
+    Attributes:
+        meta: LeRobot's metadata.
+        root: its folder.
+        tasks: sentence of each task_index.
+    """
 
     def __init__(self, meta: LeRobotDatasetMetadata, root: Path) -> None:
         self.meta = meta
@@ -40,11 +47,21 @@ class Source(View):
         self._arrow = self.rows.with_format("arrow")
         self._cache: dict[int, Episode] = {}
         self._cached_bytes = 0
+        self._picture_times: dict[Path, NDArray[np.float64]] = {}
         self._colours: dict[str, tuple[Path, Colours]] = {}
+        self._places = places(np.asarray(self.rows.data.column("episode_index").to_numpy()))
+        self.tasks = tasks_by_index(root, meta.tasks)
         if len(self.rows) != meta.total_frames:
             raise DataError(
                 f"{root}: meta/info.json declares {meta.total_frames} frames, the parquet files hold"
                 f" {len(self.rows)}; record or download the dataset again."
+            )
+        listed = [int(i) for i in meta.episodes["episode_index"]]
+        if listed != list(range(meta.total_episodes)):
+            lacking = [i for i in range(max(listed, default=0)) if i not in set(listed)][:8]
+            raise DataError(
+                f"{root}: meta/episodes lists {len(listed)} episodes out of order or with gaps (lacking"
+                f" {', '.join(map(str, lacking)) or 'none'}); restore them, and leave episodes out with cqn-data drop."
             )
 
     @property
@@ -54,9 +71,10 @@ class Source(View):
         return {k: {**v, "shape": tuple(v["shape"])} for k, v in own.items()}
 
     @property
-    def fps(self) -> int:
-        """Steps a second."""
-        return int(self.meta.fps)
+    def fps(self) -> float:
+        """Steps a second; an int where it is a whole number."""
+        rate = float(self.meta.fps)
+        return int(rate) if rate.is_integer() else rate
 
     @property
     def episodes(self) -> Sequence[int]:
@@ -121,22 +139,84 @@ class Source(View):
         """
         if index in self._cache:
             return self._cache[index]
-        row = self.meta.episodes[index]
-        start, stop = int(row["dataset_from_index"]), int(row["dataset_to_index"])
-        table = self._arrow[start:stop]
-        if stop <= start or set(table["episode_index"].to_pylist()) != {index}:
-            raise DataError(f"{self.root}: rows {start}:{stop} are not those of episode {index}; the index is damaged.")
-        times = np.asarray(table["timestamp"].to_numpy(), dtype=np.float64)
-        _refuse_uneven(index, times, self.fps)
+        table = self.table(index)
+        refuse_disorder(index, np.asarray(table["frame_index"].to_numpy()))
+        recorded = np.asarray(table["timestamp"].to_numpy(), dtype=np.float64)
+        refuse_uneven(index, recorded, self.fps)
         columns: dict[str, Any] = {}
         for key, feature in self.features.items():
             if feature["dtype"] not in NOT_NUMBERS:
-                columns[key] = _column(index, key, feature, table[key])
-        names = self.meta.tasks.index
-        tasks = [str(names[i]) for i in table["task_index"].to_pylist()]
-        episode = Episode(index, start, np.arange(len(tasks), dtype=np.int64), times, columns, tasks)
+                columns[key] = read_column(index, key, feature, table[key])
+        tasks = [self._task(index, number) for number in table["task_index"].to_pylist()]
+        frames = np.arange(len(tasks), dtype=np.int64)
+        # Where there are as many pictures as rows they belong to one another in order, whatever a clock said.
+        times = frames / self.fps if self._pictures_in(index) in (None, len(tasks)) else recorded
+        episode = Episode(index, self._places[index][0], frames, times, columns, tasks)
         self._remember(episode)
         return episode
+
+    def recorded_times(self, index: int) -> NDArray[np.float64]:
+        """(T,) time stamps of an episode as they are in the table, which LeRobot's loader takes, in seconds."""
+        return np.asarray(self.table(index)["timestamp"].to_numpy(), dtype=np.float64)
+
+    def table(self, index: int) -> Any:
+        """Rows of an episode as an Arrow table, wherever they lie in the data files.
+
+        Raises:
+            DataError: they are not as many as its metadata says, or lie in several places.
+        """
+        length, (start, stop) = int(self.meta.episodes[index]["length"]), self._places.get(index, (0, 0))
+        if stop - start != length or length < 1:
+            raise DataError(
+                f"{self.root}: meta/episodes says that episode {index} has {length} rows, the data files hold"
+                f" {stop - start} of it in one piece; the index is damaged, or the episode empty: drop it."
+            )
+        return self._arrow[start:stop]
+
+    @cached_property
+    def in_order(self) -> bool:
+        """Whether rows, their numbers and tasks are where LeRobot looks for them: by their place, from 0."""
+        starts = [self._places.get(i, (-1, 0))[0] for i in self.episodes]
+        numbers = np.asarray(self.rows.data.column("index").to_numpy())
+        return (
+            starts == [int(start) for start in self.meta.episodes["dataset_from_index"]]
+            and starts == sorted(starts)
+            and bool((numbers == np.arange(len(numbers))).all())
+            and list(self.tasks) == list(range(len(self.tasks)))
+        )
+
+    def _task(self, index: int, number: int) -> str:
+        if number not in self.tasks:
+            raise DataError(
+                f"Episode {index}: task_index {number} is not in {self.root}/meta/tasks.parquet; add it there."
+            )
+        return self.tasks[number]
+
+    def drift(self, index: int, times: NDArray[np.float64]) -> float:
+        """Largest distance, in seconds, between rows of an episode that lie at (T,) ``times`` in it and their pictures.
+
+        Raises:
+            DataError: a row has no picture of its own.
+        """
+        worst = 0.0
+        for key in self.meta.video_keys:
+            path, offset = self.video_path(index, key), self._span(index, key)[0]
+            if path not in self._picture_times:
+                self._picture_times[path] = picture_times(path)
+            apart = distances(path, self._picture_times[path], offset + times, self.fps, index)
+            worst = max(worst, float(apart.max()))
+        return worst
+
+    def _span(self, index: int, key: str) -> tuple[float, float]:
+        """Seconds in the file of a camera between which an episode's pictures lie."""
+        row = self.meta.episodes[index]
+        return float(row[f"videos/{key}/from_timestamp"]), float(row[f"videos/{key}/to_timestamp"])
+
+    def _pictures_in(self, index: int) -> int | None:
+        """How many pictures each camera has of an episode; None without videos, -1 where they do not agree."""
+        spans = (self._span(index, key) for key in self.meta.video_keys)
+        found = {round((stop - start) * self.fps) for start, stop in spans}
+        return None if not found else found.pop() if len(found) == 1 else -1
 
     def camera_frames(
         self,
@@ -157,10 +237,16 @@ class Source(View):
             yield single | (pictures if decoded else {k: p.rgb() for k, p in pictures.items()})
 
     def _video(self, episode: Episode, key: str, steps: NDArray[np.int64]) -> Iterator[Decoded]:
-        """Pictures of a camera; raises DataError where they are of another size or colour space than they should be."""
-        offset = float(self.meta.episodes[episode.index][f"videos/{key}/from_timestamp"])
-        path, declared = self.video_path(episode.index, key), picture_size(self.features[key])
-        times = offset + episode.times[steps]
+        """Pictures of a camera; raises DataError for rows beyond them, another size, or other colours than before."""
+        (offset, end), path = self._span(episode.index, key), self.video_path(episode.index, key)
+        times, declared = offset + episode.times[steps], picture_size(self.features[key])
+        beyond = np.flatnonzero(times > end - 0.5 / self.fps)
+        if len(beyond):
+            raise DataError(
+                f"Video {path}: the pictures of episode {episode.index} end at {end:.3f} s, before frame"
+                f" {int(episode.frames[steps][beyond[0]])} at {times[beyond[0]]:.3f} s; cut such rows off (cqn-data"
+                " trim), or drop the episode."
+            )
         for picture in video_pictures(path, times, self.fps, episode.index, episode.frames[steps]):
             if picture.size != declared:
                 raise DataError(
@@ -221,42 +307,3 @@ def open_source(repo_id: str, root: str | None) -> Source:
     except Exception as error:  # parquet, json and schema readers each raise their own kind
         text = " ".join(str(error).split())[:200]
         raise DataError(f"{folder} cannot be read as a LeRobotDataset: {type(error).__name__}: {text}") from error
-
-
-def _column(episode: int, key: str, feature: dict[str, Any], values: Any) -> Any:
-    """(T, …) array of one column, or list of T strings."""
-    if feature["dtype"] == "string":
-        return values.to_pylist()
-    flat = values.combine_chunks() if isinstance(values, pa.ChunkedArray) else values
-    if isinstance(flat, pa.ChunkedArray):  # some versions keep an empty or extension column in chunks
-        flat = pa.concat_arrays(flat.chunks)
-    if pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
-        flat = flat.flatten()
-    if isinstance(flat, pa.ExtensionArray):  # matrices
-        array = np.asarray(values.to_pylist(), dtype=feature["dtype"])
-    else:
-        array = flat.to_numpy(zero_copy_only=False)
-    try:
-        array = np.asarray(array).reshape(len(values), *feature["shape"])
-        missing = array.dtype == object
-    except ValueError:
-        missing = True
-    if missing:
-        raise DataError(f"Episode {episode}: '{key}' has missing values or another size than {feature['shape']}.")
-    array = array.astype(feature["dtype"])  # a copy that outlives the table
-    if np.issubdtype(array.dtype, np.floating):
-        bad = ~np.isfinite(array.reshape(len(array), -1)).all(axis=1)
-        if bad.any():
-            frame = int(np.flatnonzero(bad)[0])
-            raise DataError(f"Episode {episode}, frame {frame}: '{key}' is not finite; drop or mend this episode.")
-    return array
-
-
-def _refuse_uneven(episode: int, times: NDArray[np.float64], fps: int) -> None:
-    uneven = np.flatnonzero(np.abs(np.diff(times) * fps - 1) > JITTER)
-    if len(uneven):
-        frame = int(uneven[0]) + 1
-        raise DataError(
-            f"Episode {episode}, frame {frame}: {times[frame] - times[frame - 1]:.4f} s after the frame before it, not"
-            f" {1 / fps:.4f} s at {fps} fps; record at one rate, or drop this episode."
-        )

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot.configs import RGBEncoderConfig
+from lerobot.datasets.io_utils import write_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import StreamingVideoEncoder
 
@@ -52,7 +53,16 @@ class Target:
             self.dataset.save_episode(parallel_encoding=False)
         except RuntimeError as error:  # how LeRobot passes on what happened in an encoder's thread
             raise OutputError(f"{self.folder} could not be written: {error}") from error
+        self._say_rate()
         _give_back_memory()
+
+    def _say_rate(self) -> None:
+        """LeRobot writes down the whole part of a video's rate."""
+        meta = self.dataset.meta
+        if not float(meta.fps).is_integer():
+            for key in meta.video_keys:
+                meta.info.features[key]["info"]["video.fps"] = meta.fps
+            write_info(meta.info, meta.root)
 
     def drop_episode(self) -> None:
         """Forget the steps added since the last saved episode."""
@@ -74,7 +84,7 @@ class _Dataset(LeRobotDataset):
 
     @staticmethod
     def _build_streaming_encoder(
-        fps: int, rgb_encoder: Any, depth_encoder: Any, encoder_queue_maxsize: int, encoder_threads: int | None
+        fps: float, rgb_encoder: Any, depth_encoder: Any, encoder_queue_maxsize: int, encoder_threads: int | None
     ) -> StreamingVideoEncoder:
         return VideoEncoder(fps, rgb_encoder, depth_encoder, encoder_queue_maxsize, encoder_threads)
 
@@ -84,7 +94,7 @@ def new_dataset(
     repo_id: str,
     root: Path,
     *,
-    fps: int,
+    fps: float,
     features: Mapping[str, Mapping[str, Any]],
     robot_type: str | None = None,
     encoder: RGBEncoderConfig | None = None,

@@ -81,6 +81,8 @@ class _Film(threading.Thread):
                 stream = container.add_stream(self._settings.vcodec, self._rate, options=options)
                 stream.pix_fmt, stream.width, stream.height = self._settings.pix_fmt, frame.width, frame.height
                 stream.time_base = 1 / self._rate
+                if self._settings.vcodec in ("h264", "hevc"):
+                    stream.codec_context.max_b_frames = 0  # LeRobot cannot join a video of one picture that has a delay
                 if isinstance(picture, Decoded):
                     picture.colours.put(stream.codec_context, picture.frame.format.name)
             frame.pts, frame.time_base = self._count, 1 / self._rate

@@ -62,7 +62,7 @@ class Facts:
     """
 
     robot: str | None
-    fps: int
+    fps: float
     lengths: list[int]
     cameras: dict[str, tuple[int, int, str]]
     tasks: dict[str, int]

@@ -27,6 +27,7 @@ __all__ = ["Dataset", "Memory", "findings", "memory"]
 
 SHORT = 5  # steps
 JITTER = 0.05  # of a time step
+DENSE = 0.5  # share of an episode's steps with a reward, beyond which it is not one for success
 STILL = 0.25  # share of still steps that is worth removing
 LAG_S = 0.3
 SQUEEZE = 4.0  # how much wider the whole range of an action is than 98 % of its values
@@ -39,7 +40,7 @@ class Dataset:
     """Metadata: frames a second, columns, whether its history calls the actions differences."""
 
     repo_id: str
-    fps: int
+    fps: float
     columns: Sequence[str]
     episodes: int
     deltas: bool
@@ -170,18 +171,32 @@ def _rewards(numbers: Numbers) -> Iterator[Finding]:
         text = f"There is no '{NEXT_REWARD}' column; cqn-train takes the last step of every episode for its success."
         yield Finding("note", "no_reward", NEXT_REWARD, text, "If some failed, say which: cqn-data label.")
         return
-    failed = [e.index for e in numbers.episodes if e.first_reward is None]
-    if failed and len(failed) == len(numbers.episodes):
-        text = "No step of any episode has a reward above 0."
+    judged = numbers.judged and any(e.success for e in numbers.episodes)  # one that is never true says nothing
+    succeeded = {e.index: bool(e.success) if judged else e.first_reward is not None for e in numbers.episodes}
+    failed = [index for index, success in succeeded.items() if not success]
+    if failed and not any(succeeded.values()):
+        text = f"No step of any episode has {'next.success' if judged else 'a reward above 0'}."
         advice = "Say which episodes succeeded: cqn-data label; without a success there is nothing to learn from."
         yield Finding("error", "no_success", NEXT_REWARD, text, advice)
     elif failed:
-        text = f"{count(failed)} without a reward above 0: failures."
+        text = f"{count(failed)} without {'next.success' if judged else 'a reward above 0'}: failures."
         yield Finding("note", "failures", episodes_text(failed), text, "Fine if they did fail.")
-    early = [e.index for e in numbers.episodes if e.first_reward is not None and e.first_reward < e.steps - 1]
+    early = [e for e in numbers.episodes if e.end is not None and e.end < e.steps - 1]
     if early:
-        text = f"{count(early)} going on after the first reward; cqn-train leaves out what comes after it."
-        yield Finding("note", "early_reward", episodes_text(early), text)
+        gone = sum(e.steps - 1 - e.end for e in early if e.end is not None)
+        by = "next.success" if judged else "the reward"
+        text = (
+            f"{count(early)} going on after the end that {by} gives them; cqn-train leaves out the {gone} of"
+            f" {numbers.steps} steps after it."
+        )
+        level: Level = "warning" if gone > numbers.steps / 2 else "note"
+        advice = "If that is too much, say where they end: cqn-data label." if level == "warning" else ""
+        yield Finding(level, "early_end", episodes_text([e.index for e in early]), text, advice)
+    dense = [e.index for e in numbers.episodes if e.dense > DENSE]
+    if dense:
+        text = f"{count(dense)} with a reward in most steps, which a filter keeps and a critic adds up."
+        advice = "CQN is made for a reward of 1 at the end: cqn-data label --column=next.success (or --all)."
+        yield Finding("warning", "dense_reward", NEXT_REWARD, text, advice)
     disagree = [e.index for e in numbers.episodes if e.success not in (None, e.first_reward is not None)]
     if disagree:
         text = f"{count(disagree)} where next.success and {NEXT_REWARD} disagree."

@@ -49,7 +49,7 @@ def by_level(finding: Finding) -> int:
     return LEVELS.index(finding.level)
 
 
-def count(items: Sequence[int]) -> str:
+def count(items: Sequence[object]) -> str:
     return f"{len(items)} episode{'s' if len(items) != 1 else ''}"
 
 

@@ -128,6 +128,7 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
     from .checks import Dataset, findings
     from .finding import by_level
     from .numbers import measure
+    from .places import order, timing
     from .statistics import statistics
 
     missing = missing_videos(source)
@@ -150,8 +151,13 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
     except Exception:  # a damaged history is not what is inspected here
         deltas = False
     dataset = Dataset(repo_id, source.fps, list(source.features), len(source.episodes), deltas)
-    found = sorted([*findings(dataset, numbers, cameras, missing), *statistics(source, numbers)], key=by_level)
-    return Inspection(found, dataset, numbers, cameras)
+    found = [
+        *findings(dataset, numbers, cameras, missing),
+        *statistics(source, numbers),
+        *order(source),
+        *timing(source, numbers),
+    ]
+    return Inspection(sorted(found, key=by_level), dataset, numbers, cameras)
 
 
 def _write_page(path: Path, inspection: Inspection) -> None:

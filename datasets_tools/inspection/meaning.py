@@ -14,6 +14,10 @@ def meaning(numbers: Numbers) -> Iterator[Finding]:
     """Findings on what the dimensions of states and actions mean, by their names and by how they change."""
     yield from _names_of_joints(numbers)
     yield from _angles(numbers)
+    for key, (episode, frame) in numbers.infinite.items():
+        text = f"'{key}' is not finite, the first time in episode {episode}, frame {frame}; training does not read it."
+        advice = "Fine; or take it out: lerobot-edit-dataset --operation.type=remove_feature."
+        yield Finding("note", "infinite_column", key, text, advice)
 
 
 def _names_of_joints(numbers: Numbers) -> Iterator[Finding]:

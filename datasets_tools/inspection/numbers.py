@@ -18,6 +18,8 @@ from ..decisions.angles import full_turn, turned
 from ..decisions.joints import gripper_dims, rate_dims
 from ..decisions.pause_threshold import Motion, Suggestion
 from ..decisions.pauses import DRIVES, drives, pause_runs
+from ..decisions.rewards import demonstration_end
+from ..disk.columns import refuse_infinite
 from ..disk.source import Source
 from ..views.episode import Episode
 from .action_lag import Follow
@@ -59,6 +61,8 @@ class EpisodeNumbers:
         runs: (first step, length) of the pauses; of the first episodes only.
         gripper_events: how often the gripper opens or closes; None without a gripper.
         first_reward: frame of the first positive reward; None where there is none.
+        end: last frame of the demonstration, as cqn-train takes it.
+        dense: share of the frames up to there with a reward other than 0, [0, 1].
         success: whether it succeeded; None where the dataset does not say.
     """
 
@@ -67,6 +71,8 @@ class EpisodeNumbers:
     jitter: float
     digest: str
     first_reward: int | None = None
+    end: int | None = None
+    dense: float = 0.0
     success: bool | None = None
     still: float = 0.0
     still_start: int = 0
@@ -103,7 +109,11 @@ class Dimension:
 
 @dataclass
 class Numbers:
-    """Everything measured; episodes that cannot be read are in ``bad`` with the reason."""
+    """Everything measured; episodes that cannot be read are in ``bad`` with the reason.
+
+    ``rewarded`` and ``judged``: whether there is a column of rewards, of successes; ``infinite``: the first episode and
+    frame of columns that training does not read and that are not finite.
+    """
 
     episodes: list[EpisodeNumbers] = field(default_factory=list)
     bad: dict[int, str] = field(default_factory=dict)
@@ -113,7 +123,9 @@ class Numbers:
     jump_count: int = 0
     tasks: dict[str, int] = field(default_factory=dict)
     rewarded: bool = False
+    judged: bool = False
     follow: Follow | None = None
+    infinite: dict[str, tuple[int, int]] = field(default_factory=dict)
 
     @property
     def steps(self) -> int:
@@ -132,7 +144,7 @@ def measure(source: Source, advance: Callable[[], None] = lambda: None) -> Numbe
         source: an opened dataset.
         advance: called after each episode of each round.
     """
-    numbers = Numbers(rewarded=NEXT_REWARD in source.features)
+    numbers = Numbers(rewarded=NEXT_REWARD in source.features, judged=NEXT_SUCCESS in source.features)
     for column in (STATE, ACTION):
         if column in source.features:
             names = dimension_names(source.features[column])
@@ -164,6 +176,7 @@ def _readable(source: Source, numbers: Numbers, advance: Callable[[], None]) -> 
     for index in source.episodes:
         try:
             episode = source.episode(index)
+            refuse_infinite(episode)
         except DataError as error:
             numbers.bad[index] = str(error)
         else:
@@ -186,7 +199,12 @@ def _first_look(source: Source, episode: Episode, numbers: Numbers) -> None:
         numbers.follow.add(_vectors(episode, ACTION), _vectors(episode, STATE))
     for task in episode.tasks:
         numbers.tasks[task] = numbers.tasks.get(task, 0) + 1
-    uneven = np.abs(np.diff(episode.times) * source.fps - 1)
+    for key, values in episode.columns.items():
+        if key not in numbers.infinite and np.issubdtype(np.asarray(values).dtype, np.floating):
+            bad = np.flatnonzero(~np.isfinite(_vectors(episode, key)).all(axis=1))
+            if len(bad):
+                numbers.infinite[key] = (episode.index, int(bad[0]))
+    uneven = np.abs(np.diff(source.recorded_times(episode.index)) * source.fps - 1)
     summary = EpisodeNumbers(episode.index, len(episode), float(uneven.max(initial=0.0)), _digest(episode))
     if NEXT_REWARD in episode.columns:
         paid = np.flatnonzero(_vectors(episode, NEXT_REWARD)[:, 0] > 0)
@@ -194,6 +212,9 @@ def _first_look(source: Source, episode: Episode, numbers: Numbers) -> None:
         summary.success = bool(len(paid))
     if NEXT_SUCCESS in episode.columns:
         summary.success = bool(np.asarray(episode.columns[NEXT_SUCCESS], bool).any())
+    summary.end, _ = demonstration_end(episode.columns, len(episode))
+    if NEXT_REWARD in episode.columns:
+        summary.dense = float((_vectors(episode, NEXT_REWARD)[: summary.end + 1, 0] != 0).mean())
     numbers.episodes.append(summary)
 
 

@@ -42,6 +42,10 @@ observation.state[gripper.pos], followed by .first, .last, .min, .max, .mean or 
         if not self.episodes and not self.where:
             raise ConfigError("Nothing to drop: expected --episodes='[…]' or --where='RULE'.")
 
+    def reads_numbers(self) -> bool:
+        """What is left out may be infinite."""
+        return False
+
     def on(self, view: "View") -> "DerivedView":
         """Find the episodes; raises ConfigError for a number that is not there."""
         import numpy as np

@@ -65,6 +65,10 @@ class Step:
     def validate(self) -> None:
         """Check ranges; raises ConfigError naming the option, what was expected and what was found."""
 
+    def reads_numbers(self) -> bool:
+        """Whether states, actions and rewards decide what is done: then all of them must be finite before."""
+        return True
+
     def on(self, view: "View") -> "DerivedView":
         """Look at all episodes, print what will be done, and return the view after this operation.
 
@@ -118,6 +122,7 @@ def run_job(job: Job, steps: Sequence[Step], name: str | None = None) -> list[di
     for step in steps:
         step.validate()
     load_lerobot()
+    from ..disk.columns import refuse_infinite
     from ..disk.encode import write
     from ..disk.readable import readable
     from ..disk.source import open_source
@@ -135,10 +140,15 @@ def run_job(job: Job, steps: Sequence[Step], name: str | None = None) -> list[di
     for step in steps:
         if len(steps) > 1:
             result(f"[{step.name}]")
+        if step.reads_numbers():
+            for index in view.episodes:
+                refuse_infinite(view.episode(index))
         view = step.on(view)
         view.entry.update({"operation": step.name, "source": job.repo_id, "target": new_repo_id})
         if sentence := step.told(view.entry):
             view.entry["told"] = sentence
+    for index in view.episodes:
+        refuse_infinite(view.episode(index))
     _check_bounds(steps, view, source.bounds is not None)
     entries = view.history()[before:]
     if job.report:

@@ -1,6 +1,7 @@
 """Show what a filter leaves out: a short video with the dropped frames in red, or curves of the joints."""
 
 from collections.abc import Iterator
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -56,13 +57,14 @@ def _write_video(path: Path, before: View, after: View, rule: Rule) -> None:
 
     if not before.cameras:
         raise ConfigError("The dataset has no camera to film; take --preview=FILE.png for curves of the joints.")
-    left = SECONDS * before.fps
+    left = round(SECONDS * before.fps)
     with av.open(str(path), "w") as container:
         stream: Any = None
         for index in before.episodes:
             for picture in _marked(before, after, index):
                 if stream is None:
-                    stream = container.add_stream("libx264", rate=before.fps, options={"crf": "23"})
+                    rate = Fraction(before.fps).limit_denominator(1001)
+                    stream = container.add_stream("libx264", rate=rate, options={"crf": "23"})
                     stream.height, stream.width = picture.shape[:2]
                     stream.pix_fmt = "yuv420p"
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))

@@ -61,6 +61,10 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
 
         return Filter(threshold=self.threshold, auto=self.auto)
 
+    def reads_numbers(self) -> bool:
+        """What is left out may be infinite."""
+        return self.motion
+
     def on(self, view: "View") -> "DerivedView":
         """Find where each episode begins and ends; raises DataError where too little or a reward would be lost."""
         import numpy as np

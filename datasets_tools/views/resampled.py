@@ -23,7 +23,7 @@ class Resampled(DerivedView):
     rate: int = 1
 
     @property
-    def fps(self) -> int:
+    def fps(self) -> float:
         """The new rate."""
         return self.rate
 
@@ -37,14 +37,14 @@ class Resampled(DerivedView):
         return _resampled(self.parent.episode(index), self.parent.fps, self.rate, self.parent.deltas)
 
 
-def windows(steps: int, old: int, new: int) -> NDArray[np.int64]:
+def windows(steps: int, old: float, new: float) -> NDArray[np.int64]:
     """(K,) first row of each new step; the rows until the next one belong to it. ``new`` < ``old``, in Hz."""
-    count = -(-steps * new // old)
+    count = int(-(-steps * new // old))
     starts: NDArray[np.int64] = np.floor(np.arange(count) * (old / new) + 0.5).astype(np.int64)
     return starts[starts < steps]
 
 
-def _resampled(episode: Episode, old: int, new: int, deltas: DeltaJoints | None) -> Episode:
+def _resampled(episode: Episode, old: float, new: float, deltas: DeltaJoints | None) -> Episode:
     rows = windows(len(episode), old, new)
     last = np.append(rows[1:], len(episode)) - 1
     chosen = select(episode, rows, deltas, action_rows=last)

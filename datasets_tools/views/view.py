@@ -29,7 +29,7 @@ class View(ABC):
 
     @property
     @abstractmethod
-    def fps(self) -> int:
+    def fps(self) -> float:
         """Steps a second."""
 
     @property
@@ -107,7 +107,7 @@ class DerivedView(View):
         return self.parent.features
 
     @property
-    def fps(self) -> int:
+    def fps(self) -> float:
         """That of the view before."""
         return self.parent.fps
 

@@ -116,7 +116,7 @@ PROVOKED = {
     "duplicates": ("warning", [*pair(), demonstration(0)], "0 = 2"),
     "no_success": ("error", pair(reward=np.zeros_like), "No step of any episode"),
     "failures": ("note", [demonstration(0), change(1, reward=np.zeros_like)], "1 episode without a reward"),
-    "early_reward": ("note", [demonstration(0), change(1, reward=np.ones_like)], "going on after the first reward"),
+    "early_end": ("note", [demonstration(0), change(1, reward=np.ones_like)], "leaves out the 59 of 120 steps"),
     "no_reward": ("note", only(STATE, ACTION), "last step"),
     "idle_gripper": ("note", pair(action=lambda v: v * [1, 1, 0]), "neither opens nor closes"),
     "gripper_events": ("note", [*pair(), change(2, action=chatter)], "episode 2: 59"),

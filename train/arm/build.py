@@ -68,7 +68,7 @@ def make_operated(
     check_robot_fits(robot, agent)
     if demonstrations is not None:
         _check_names(robot, demonstrations.meta.features)
-    fps = config.arm.fps or (int(demonstrations.meta.fps) if demonstrations is not None else None)
+    fps = config.arm.fps or (round(demonstrations.meta.fps) if demonstrations is not None else None)
     if fps is None:
         raise ConfigError("How many control steps a second? Give --arm.fps (that of the demonstrations).")
     seen_fps = demonstrations.meta.fps if demonstrations is not None else fps

@@ -14,8 +14,9 @@ from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from numpy.typing import NDArray
 
+from cqn_data.decisions.rewards import REWARD_FEATURES, demonstration_end
 from lerobot_cqn.errors import DataError
-from lerobot_cqn.schema import NEXT_REWARD
+from lerobot_cqn.schema import NEXT_REWARD, NEXT_SUCCESS
 
 from ..agent import Agent
 from ..config import DatasetSettings, Recipe
@@ -24,6 +25,8 @@ from .episode import Episode
 __all__ = ["Demonstrations", "counts_as_demonstration", "load_metadata"]
 
 logger = logging.getLogger(__name__)
+
+KEPT = 0.5  # of the steps; where fewer come before the ends of their episodes, a line says so
 
 
 def counts_as_demonstration(recipe: Recipe, *, success: bool) -> bool:
@@ -84,9 +87,10 @@ class Demonstrations:
         return np.stack([columns[int(row)][OBS_STATE] for row in first])
 
     def episodes(self, agent: Agent, on_episode: Callable[[int, int], None] = lambda _i, _n: None) -> list[Episode]:
-        """Episodes, in the policy's normalised units, cut after their first success.
+        """Episodes, in the policy's normalised units, cut where they end (`demonstration_end`).
 
-        Without a reward column the last step of each episode counts as the success (reward 1), and a line says so.
+        Without a reward column the last step of each episode counts as the success (reward 1), and a line says so; one
+        says so, too, where most steps come after the ends.
         Datasets do not store what came after the last action: the last observation stands in for it.
         Raises DataError for a missing feature, another size, or values that are not finite.
         """
@@ -104,15 +108,17 @@ class Demonstrations:
                     "policy: train a new policy, or give the dataset this one was trained on."
                 )
         rewarded = NEXT_REWARD in dataset.features
+        judged = [key for key in REWARD_FEATURES if key in dataset.features]
         columns = dataset.hf_dataset.with_format("numpy")
         numbers = np.asarray(columns["episode_index"])
-        raw = {
-            key: _column(columns, key) for key in (*policy.low_dim_keys, ACTION, *([NEXT_REWARD] if rewarded else []))
-        }
+        raw = {key: _column(columns, key) for key in (*policy.low_dim_keys, ACTION, *judged)}
         _check_finite(raw, numbers)
         if not rewarded:
             logger.warning("No '%s' column: the last step of each episode counts as the success.", NEXT_REWARD)
-        vectors = {key: torch.from_numpy(value).float() for key, value in raw.items() if key != NEXT_REWARD}
+        if NEXT_SUCCESS in raw and rewarded and not raw[NEXT_SUCCESS].any() and (raw[NEXT_REWARD] > 0).any():
+            logger.warning("'%s' is never true, though rewards are positive: it is not looked at.", NEXT_SUCCESS)
+            judged.remove(NEXT_SUCCESS)
+        vectors = {key: torch.from_numpy(value).float() for key, value in raw.items() if key not in REWARD_FEATURES}
         if not policy.low_dim_keys:  # LeRobot's steps insist on an observation; pictures are decoded below
             vectors[policy.view_keys[0]] = torch.zeros(1, 3, 1, 1)
         prepared = agent.prepare(vectors)
@@ -121,12 +127,11 @@ class Demonstrations:
         ids = np.unique(numbers)
         for count, number in enumerate(ids):
             rows = np.flatnonzero(numbers == number)
+            last, success = demonstration_end({key: raw[key][rows] for key in judged}, len(rows))
             reward = raw[NEXT_REWARD][rows].reshape(-1) if rewarded else np.zeros(len(rows), np.float32)
             if not rewarded:
-                reward[-1] = 1.0
-            success = bool((reward > 0).any())
-            if success:  # demonstrations end at the first success
-                rows = rows[: int(np.argmax(reward > 0)) + 1]
+                reward[last] = float(success)
+            rows = rows[: last + 1]
             observed = np.append(rows, rows[-1])
             pixels = tuple(
                 view[np.append(np.arange(len(rows)), len(rows) - 1)] for view in _decode(dataset, agent, rows)
@@ -142,6 +147,13 @@ class Demonstrations:
                 )
             )
             on_episode(count + 1, len(ids))
+        kept = sum(len(episode.action) for episode in episodes)
+        if kept < KEPT * len(numbers):
+            logger.warning(
+                "Only %d of %d demonstrated steps come before the ends that %s gives them; the others are left out. If "
+                "that is wrong, say where episodes end: `cqn-data label`.",
+                kept, len(numbers), " and ".join(judged),
+            )  # fmt: skip
         return episodes
 
 
