@@ -263,7 +263,14 @@ class Source(View):
 
     def _still(self, episode: Episode, key: str, row: int) -> NDArray[np.uint8]:
         try:
-            return np.asarray(self.rows.with_format(None)[row][key].convert("RGB"))
+            picture = self.rows.with_format(None)[row][key]
+            if picture.mode[0] in "IF":  # converting them would cut everything above 255 off
+                raise DataError(
+                    f"Episode {episode.index}, frame {row - episode.start}: the picture '{key}' has more than 8 bits"
+                    f" ({picture.mode}), as depth has; take the column out first: lerobot-edit-dataset"
+                    " --operation.type=remove_feature."
+                )
+            return np.asarray(picture.convert("RGB"))
         except (OSError, AttributeError, SyntaxError) as error:
             frame = row - episode.start
             raise DataError(f"Episode {episode.index}, frame {frame}: the picture '{key}' cannot be read.") from error

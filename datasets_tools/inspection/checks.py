@@ -1,5 +1,6 @@
 """Judgements of ``cqn-data inspect`` on its numbers: findings with a level, a place and an advice."""
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -97,10 +98,14 @@ def _readable(dataset: Dataset, numbers: Numbers) -> Iterator[Finding]:
         yield Finding("error", "no_episodes", "dataset", "Not one episode can be read.", advice)
     if ACTION not in dataset.columns:
         text = f"There is no '{ACTION}' column; found {', '.join(dataset.columns)}."
-        yield Finding("error", "no_action", ACTION, text, "Rename the column that holds the commands.")
+        yield Finding(
+            "error", "no_action", ACTION, text, _renamed(dataset, ACTION, "the column that holds the commands")
+        )
     if STATE not in dataset.columns:
         text = f"There is no '{STATE}' column, so pauses, jumps and lag cannot be looked for."
-        yield Finding("warning", "no_state", STATE, text, "Record the joint positions too, if the robot has any.")
+        yield Finding(
+            "warning", "no_state", STATE, text, _renamed(dataset, STATE, "the joint positions, if there are any")
+        )
     short = [e.index for e in numbers.episodes if e.steps < SHORT]
     if short:
         yield Finding(
@@ -110,6 +115,17 @@ def _readable(dataset: Dataset, numbers: Numbers) -> Iterator[Finding]:
             f"{count(short)} shorter than {SHORT} steps.",
             advice_to_drop(short),
         )
+
+
+def _renamed(dataset: Dataset, key: str, what: str) -> str:
+    """Advice for a column that goes by another name, as in openpi's datasets."""
+    other = next((k for k in dataset.columns if k.removesuffix("s") == key.rpartition(".")[2] and k != key), None)
+    if other is None:
+        return f"Record {what} as '{key}'."
+    said = f"'{other}' may be it: rename it to '{key}' in meta/info.json, meta/stats.json and the data files"
+    if key == ACTION:
+        return said + "."
+    return said + f"; lerobot-train renames it for itself: --rename_map='{json.dumps({other: key})}'."
 
 
 def _videos(cameras: Sequence[CameraLook], missing: Mapping[str, Sequence[int]]) -> Iterator[Finding]:

@@ -110,7 +110,13 @@ def main(args: list[str]) -> int:
         return 1
     inspection = inspect_dataset(config.repo_id, source)
     if page is not None:
-        _write_page(page, inspection)
+        try:
+            _write_page(page, inspection)
+        except OSError as error:
+            if isinstance(error, OutputExistsError) or config.html:  # asked for by name
+                raise
+            note(f"No page was written here ({error.strerror}); --html=FILE names another place.")
+            page = None
     if config.json:
         _print_json(config, inspection)
     else:
