@@ -19,7 +19,7 @@ class CommonSettings:
     """
 
     # Observation
-    frame_stack: int = number(8, least=1)  # S; joints and environment state are stacked like the images
+    frame_stack: int = number(8, least=1, most=32)  # S; joints and environment state are stacked like the images
     shift_pixels: int = number(4, least=0)  # random shift, 0 is off
     brightness: float = number(0.0, least=0)  # factor drawn from 1 +- this
     contrast: float = number(0.0, least=0)  # likewise, around the picture's mean
@@ -39,7 +39,7 @@ class CommonSettings:
     rl_loss_scale: float = number(0.1, least=0)  # 0 leaves imitation alone
     bc_loss_scale: float = number(1.0, least=0)  # weight of the imitation losses; 0 leaves RL alone
     discount: float = number(0.99, above=0, most=1)  # the authors' implementation; the paper gives no number
-    n_step: int = number(3, least=1)  # n, steps of reward before the value of what follows
+    n_step: int = number(3, least=1, most=1000)  # n, steps of reward before the value of what follows
     # Optimisation
     lr: float = number(5e-5, above=0)  # learning rate of AdamW
     weight_decay: float = number(0.1, least=0)  # of AdamW

@@ -121,7 +121,7 @@ class RunConfig:
     dataset: DatasetSettings = field(default_factory=DatasetSettings)
     output_dir: Path | None = None  # a new or empty folder for checkpoints and metrics
     resume: bool = False  # continue the run in output_dir from its last checkpoint
-    seed: int = number(1000, least=0)  # of weights, batches, exploration and training scenes
+    seed: int = number(1000, least=0, most=20_000)  # of weights, batches, exploration and training scenes
     steps: int = number(30_000, least=0)  # control steps online, then the episode is finished; 0 trains offline only
     # of acting and learning, waits for a person not counted; None: `steps` alone
     online_minutes: float | None = number(None, above=0)
@@ -136,7 +136,7 @@ class RunConfig:
     # environment steps between checkpoints; the end and an interrupt always save
     save_freq: int = number(5000, least=1)
     log_freq: int = number(50, least=1)  # updates between rows of updates.csv
-    threads: int = number(0, least=0)  # torch threads; 0 leaves torch's choice
+    threads: int = number(0, least=0, most=256)  # torch threads; 0 leaves torch's choice
     replay: ReplaySettings = field(default_factory=ReplaySettings)
     eval: EvalSettings = field(default_factory=EvalSettings)
     tensorboard: bool = False  # the tables as TensorBoard events in output_dir/tensorboard, too
@@ -156,6 +156,13 @@ class RunConfig:
             check_repo_id(self.policy.repo_id or "", "--policy.repo_id")
         acts_in = self._validated_world()
         recipe = self.recipe
+        if not recipe.batch_size + recipe.demo_batch_size:
+            raise ConfigError("A batch of nothing: give --batch_size or --demo_batch_size above 0.")
+        chosen = self.dataset.episodes or []
+        if len({*chosen}) < len(chosen) or any(episode < 0 for episode in chosen):
+            raise ConfigError(
+                f"`dataset.episodes` must be different numbers from 0 on, got {chosen}: each episode counts once."
+            )
         learns_from_data = recipe.demo_batch_size > 0 or self.offline_updates > 0
         if not self.dataset.repo_id and (learns_from_data or (recipe.action_bounds == "data" and not self.continues)):
             raise ConfigError(

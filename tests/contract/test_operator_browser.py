@@ -261,7 +261,7 @@ def test_curve_progress_health_and_log(server: OperatorServer, board: Board, vis
     for number in range(7):
         board.log({"episodes/episode": number, "episodes/success": int(number > 2)})
     board.log({"evaluations/episodes": 6, "evaluations/success_rate": 0.5})
-    board.health(rate_hz=4.98, late=2, gripper="<b>closed</b>")
+    board.health(rate_hz=4.98, worst_ms=915.15, late=2, gripper="<b>closed</b>")
     board.message("a <i>line</i>")
     board.session.learning("updates after episode 6")
     board.phase("updates", 400, 0)
@@ -269,6 +269,7 @@ def test_curve_progress_health_and_log(server: OperatorServer, board: Board, vis
     until(page, "document.querySelectorAll('#curve circle').length === 7")
     assert page.locator("#curve rect").count() == page.locator("#curve polyline").count() == 1
     assert "Control rate\n5.0 Hz" in page.locator("#health").inner_text()
+    assert "Longest step\n915 ms" in page.locator("#health").inner_text()
     assert "<b>closed</b>" in page.locator("#health").inner_text()  # a text, not a page
     assert "a <i>line</i>" in page.locator("#log").inner_text()
     assert "updates 100 of 400" in page.locator("#working-text").inner_text()

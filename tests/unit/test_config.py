@@ -75,8 +75,10 @@ def test_unknown_presets_suggest_a_known_one() -> None:
         ("levels", 0, "`levels` must be at least 1, got 0"),
         ("bins", 1, "`bins` must be at least 2, got 1"),
         ("atoms", 1, "`atoms` must be at least 2"),
-        ("n_step", 0, "`n_step` must be at least 1"),
-        ("frame_stack", 0, "`frame_stack` must be at least 1"),
+        ("n_step", 0, "`n_step` must be 1 to 1000"),
+        ("n_step", 1_000_000, "`n_step` must be 1 to 1000"),
+        ("frame_stack", 0, "`frame_stack` must be 1 to 32"),
+        ("frame_stack", 99, "`frame_stack` must be 1 to 32"),
         ("tau", 0.0, r"`tau` must be in \(0, 1\], got 0"),
         ("discount", 1.1, r"`discount` must be in \(0, 1\], got 1.1"),
         ("discount", float("nan"), "`discount`"),
@@ -179,9 +181,18 @@ def test_runs_are_checked() -> None:
         draccus.parse(RunConfig, args=[*policy, *rest, *arguments]).validate()
 
     validate()
-    for option in ("steps", "offline_updates", "seed", "threads", "batch_size", "updates_per_step"):
+    for option in ("steps", "offline_updates", "batch_size", "updates_per_step"):
         with pytest.raises(ConfigError, match=f"`{option}` must be at least 0, got -1"):
             validate(f"--{option}=-1")
+    for option, most, values in (("seed", 20_000, (-1, 20_001, 10**20)), ("threads", 256, (-1, 257, 100_000))):
+        for value in values:
+            with pytest.raises(ConfigError, match=f"`{option}` must be 0 to {most}, got {value}"):
+                validate(f"--{option}={value}")
+    with pytest.raises(ConfigError, match="A batch of nothing"):
+        validate("--batch_size=0", "--demo_batch_size=0")
+    for episodes in ("[0,0]", "[-1]", "[3,1,3]"):
+        with pytest.raises(ConfigError, match=r"`dataset\.episodes` must be different numbers from 0 on"):
+            validate(f"--dataset.episodes={episodes}")
     for option in ("save_freq", "log_freq"):
         with pytest.raises(ConfigError, match=f"`{option}` must be at least 1, got 0"):
             validate(f"--{option}=0")
@@ -217,12 +228,13 @@ def test_runs_on_an_arm_have_defaults_of_their_own() -> None:
         (["--eval.freq=-1"], r"`eval\.freq` must be at least 0, got -1"),
         (["--page.port=65536"], r"`page\.port` must be 0 to 65535"),
         (["--page.absent_s=0.5"], r"`page\.absent_s` must be 1 to 3600 seconds, got 0\.5"),
-        (["--arm.fps=0"], r"`arm\.fps` must be 1 to 1000, got 0"),
+        (["--arm.fps=0"], r"`arm\.fps` must be 1 to 200, got 0"),
         (["--arm.episode_s=0"], r"`arm\.episode_s` must be 0\.1 to 3600"),
         (["--arm.joint_margin=-0.1"], r"`arm\.joint_margin` must be 0 to 1"),
         (["--arm.step_factor=0"], r"`arm\.step_factor` must be 0\.1 to 100"),
         (["--arm.home_speed=0"], r"`arm\.home_speed` must be 0\.001 to 1"),
         (["--arm.home_speed=1.5"], r"`arm\.home_speed` must be"),
+        (["--arm.fps=1000"], r"`arm\.fps` must be 1 to 200, got 1000"),
         (["--arm.stale_s=0"], r"`arm\.stale_s` must be"),
         (["--arm.watchdog_s=60"], r"`arm\.watchdog_s` must be 0\.05 to 10"),
         (["--arm.watchdog_s=nan"], r"`arm\.watchdog_s` must be"),

@@ -12,7 +12,7 @@ __all__ = ["ArmSettings"]
 class ArmSettings:
     """The arm of `--robot.type`: its rate, its limits, what an episode is. Joints are in the robot's own units."""
 
-    fps: int | None = number(None, least=1, most=1000)  # control steps a second; None: the dataset's
+    fps: int | None = number(None, least=1, most=200)  # control steps a second; None: the dataset's
     # seconds until an episode is cut off and its label is waited for
     episode_s: float = number(30.0, least=0.1, most=3600, unit="seconds")
     # goals may go so far beyond the joints of the demonstrations, a share of their range

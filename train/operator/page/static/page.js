@@ -21,8 +21,8 @@ const NAMES = {
 const KEYS = { " ": "Space", escape: "Esc" };
 const URGENT = ["stop", "pause"]; // everybody's, at any time
 const FACTS = {
-  rate_hz: ["Control rate", "Hz", 1], jitter_ms: ["Jitter", "ms", 1], late: ["Late steps", "", 0],
-  limited: ["Goals limited", "", 0], faults: ["Faults", "", 0], env_steps: ["Steps", "", 0], updates: ["Updates", "", 0],
+  rate_hz: ["Control rate", "Hz", 1], jitter_ms: ["Unevenness of steps", "ms", 1],
+  worst_ms: ["Longest step", "ms", 0], late: ["Late steps", "", 0], limited: ["Goals changed by limits", "", 0], faults: ["Faults", "", 0], env_steps: ["Steps", "", 0], updates: ["Updates", "", 0],
   loss: ["Loss", "", 4], mean_q: ["Mean Q", "", 2], demonstrations: ["Demonstrations", "", 0],
 };
 
@@ -200,7 +200,7 @@ function facts(id, values) {
   $(`no-${id}`).hidden = entries.length > 0;
   const known = new Map([...list.children].map((child) => [child.dataset.name, child]));
   for (const [name, value] of entries) {
-    const [title, unit, digits] = FACTS[name] || [name.replaceAll("_", " "), "", 2];
+    const [title, unit, digits] = FACTS[name] || [name.replaceAll("_", " "), "", 1];
     let entry = known.get(name);
     if (!entry) {
       entry = document.createElement("div");
@@ -209,7 +209,7 @@ function facts(id, values) {
       entry.firstChild.textContent = title;
       list.append(entry);
     }
-    const text = typeof value === "number" ? (Number.isInteger(value) ? value.toLocaleString("en") : value.toFixed(digits || 1)) : value === null ? "–" : value;
+    const text = typeof value === "number" ? (Number.isInteger(value) ? value.toLocaleString("en") : value.toFixed(digits)) : value === null ? "–" : value;
     say(entry.lastChild, unit && value !== null ? `${text} ${unit}` : String(text));
   }
 }
