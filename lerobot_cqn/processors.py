@@ -111,9 +111,10 @@ def make_processors(
     remember, to_goal = _goal_steps(meta)
     stats = _tensors_to_numpy(dataset_stats or {})
     margin = config.settings.action_margin
-    if meta is not None and ACTION in meta.features:
-        check_scaling(stats, meta, margin=margin, state_bound=config.settings.state_bound)
     features: dict[str, PolicyFeature] = {**(config.input_features or {}), **(config.output_features or {})}
+    if meta is not None and ACTION in meta.features:
+        bound = config.settings.state_bound if OBS_STATE in features else None
+        check_scaling(stats, meta, margin=margin, state_bound=bound)
     norm_map = {FeatureType(k): NormalizationMode(v) for k, v in config.normalization_mapping.items()}
     pre = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]](
         steps=[

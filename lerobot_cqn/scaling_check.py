@@ -24,21 +24,22 @@ type Array = NDArray[np.float64]
 REMEDY = "write them anew: lerobot-edit-dataset --operation.type=recompute_stats, or any operation of cqn-data"
 
 
-def check_scaling(stats: Mapping[str, Any], meta: Any, *, margin: float, state_bound: float) -> None:
+def check_scaling(stats: Mapping[str, Any], meta: Any, *, margin: float, state_bound: float | None) -> None:
     """Compare the statistics that a policy is to be trained with, and the rows of its dataset.
 
     Args:
         stats: LeRobot's statistics by feature, with `min` and `max`; what is not the dataset's own is not looked at.
         meta: LeRobot's metadata of the dataset; rows that are not on this disk are not looked at.
         margin: share of the range by which action bounds are widened at either end, >= 0.
-        state_bound: normalised states beyond +- this are cut, > 0.
+        state_bound: normalised states beyond +- this are cut, > 0; None: the policy does not look at the state.
 
     Raises:
         DataError: statistics of the action or the state are missing, or cut more than `MOST_CUT` of a dimension's
             values, or more than was asked for with `cqn-data bounds --quantile`.
     """
     place = Path(meta.root) / "meta" / "stats.json"
-    for key, beyond in ((ACTION, margin), (STATE, (state_bound - 1) / 2)):
+    looked_at = {ACTION: margin} if state_bound is None else {ACTION: margin, STATE: (state_bound - 1) / 2}
+    for key, beyond in looked_at.items():
         feature, given, own = meta.features.get(key), stats.get(key) or {}, (meta.stats or {}).get(key) or {}
         if feature is None or any(end in given and not np.array_equal(given[end], own.get(end, ())) for end in ENDS):
             continue  # bounds from elsewhere, such as the environment's

@@ -1,6 +1,7 @@
 """What the columns of a recording mean: velocities, names of any kind, whole numbers, angles that wrap, depth."""
 
 import json
+import logging
 
 import numpy as np
 import pytest
@@ -227,7 +228,8 @@ def test_a_policy_does_not_look_at_depth(tmp_path, caplog):
     meta = LeRobotDataset("local/src", root).meta
     assert meta.depth_keys == ["observation.images.depth"]
     config = CQNConfig(device="cpu", preset="laptop_pixels", push_to_hub=False)
-    policy = make_policy(config, ds_meta=meta)
+    with caplog.at_level(logging.WARNING):
+        policy = make_policy(config, ds_meta=meta)
     assert policy.view_keys == (TOP,)
     assert "observation.images.depth is left out" in caplog.text
     make_pre_post_processors(config, dataset_stats=meta.stats)

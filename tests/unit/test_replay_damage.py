@@ -13,7 +13,7 @@ from cqn_train.replay.files import Rows, reserve_all
 from lerobot_cqn.errors import DataError, OutputError
 
 from .test_replay import make_episode
-from .test_replay_storage import ROW, small
+from .test_replay_files import ROW, small
 
 EPISODES = 6
 
