@@ -122,9 +122,10 @@ class Agent:
             raise DataError(f"The policy needs the camera '{missing[0]}', the observation has {found or 'none'}.")
         views = []
         for key in self.policy.view_keys:
-            own = None if given is None else given.get(key)
-            same = own is not None and own.dtype == torch.uint8 and own.shape == prepared[key].shape
-            views.append(_to_uint8(own if same and own is not None else prepared[key]))
+            pixels, own = prepared[key], (given or {}).get(key)
+            if own is not None and own.dtype == torch.uint8 and own.shape == pixels.shape:
+                pixels = own
+            views.append(_to_uint8(pixels))
         return views
 
 

@@ -31,7 +31,6 @@ from .push.send import check_account
 from .replay.buffer import Replay
 from .replay.demonstrations import Demonstrations
 from .replay.episode import Episode
-from .replay.files import Place
 from .run.beginning import BEGUN, beginning, forget_beginning
 from .run.checkpoint import Counters, last_checkpoint, restore, save, seed_everything, stored_episodes
 from .run.durable import check_room
@@ -90,9 +89,7 @@ def build(
             accepted = config.replay.accept_loss
             replay.examine(stored_episodes(checkpoint), accept_loss=accepted, say=monitor.message)
         load_demonstrations(run, data, world, replay, monitor)
-        finished: list[Place] = []
-        if checkpoint is not None:
-            finished = replay.reopen()
+        finished = replay.reopen() if checkpoint is not None else []
     run.output_dir.mkdir(parents=True, exist_ok=True)
     if checkpoint is None and replay.episodes:
         picture = run.output_dir / "first_batch.png"
@@ -214,9 +211,8 @@ def new_agent(run: ValidRun, data: Demonstrations | None, env_bounds: Bounds | N
         raise ConfigError("An arm needs demonstrations, or a policy that was trained on some: give --dataset.repo_id.")
     source: dict[str, Any] = {"env_cfg": run.acts_in} if meta is None else {"ds_meta": meta}
     policy: Any = make_policy(run.policy, **source)
-    stats: dict[str, Any] = (
-        {} if data is None else dict(data.dataset.meta.stats or {})
-    )  # its rows are there from here on
+    # Of the opened dataset: its rows are on this disk from here on.
+    stats: dict[str, Any] = {} if data is None else dict(data.dataset.meta.stats or {})
     if run.config.recipe.action_bounds == "environment":
         if meta is not None and converted_deltas(meta) is not None:
             raise ConfigError(

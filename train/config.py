@@ -75,7 +75,7 @@ class EvalSettings:
 
 @dataclass
 class ReplaySettings:
-    """The replay on disk, in output_dir/replay, on disk, so that a kill loses no finished episode."""
+    """The replay, in output_dir/replay on disk, so that a kill loses no finished episode."""
 
     # of the demonstrations and the run's episodes together; the oldest make room
     capacity_gib: float = number(16.0, above=0)

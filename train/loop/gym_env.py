@@ -61,11 +61,11 @@ class _Gym:
 
     def frame(self, observation: Any) -> Frame:
         """An observation under LeRobot's names."""
-        frame: Frame = preprocess_observation(observation)
-        if not self._pre.steps:  # else they expect the pictures as LeRobot makes them, floats
-            frame |= _pictures(observation)
-        prepared: Frame = self._pre(frame)
-        return prepared
+        # Where there are steps, they expect the pictures as LeRobot makes them, floats.
+        pictures = Frame() if self._pre.steps else _pictures(observation)
+        rest = {name: value for name, value in observation.items() if name != "pixels"} if pictures else observation
+        frame: Frame = self._pre(preprocess_observation(rest) | pictures)
+        return frame
 
 
 class GymEnvironment(_Gym):
@@ -143,11 +143,16 @@ class GymScenes(_Gym):
 
 
 def _pictures(observation: Mapping[str, Any]) -> Frame:
-    """Pictures as the environment gave them, uint8 [K, 3, H, W], under LeRobot's names."""
+    """Pictures as the environment gave them, uint8 [K, 3, H, W], under LeRobot's names.
+
+    None at all where one is not uint8 with its channels last: LeRobot says what is wrong with it.
+    """
     pixels, frame = observation.get("pixels", {}), Frame()
     several = isinstance(pixels, Mapping)
     named = {f"{OBS_IMAGES}.{name}": picture for name, picture in pixels.items()} if several else {OBS_IMAGE: pixels}
     for key, picture in named.items():
+        if picture.dtype != np.uint8 or picture.shape[-1] >= min(picture.shape[-3:-1]):
+            return Frame()
         channels_first = np.moveaxis(picture, -1, -3)
         # A copy: an environment may draw its next picture into the same memory.
         frame[key] = torch.from_numpy(np.array(channels_first, order="C").reshape(-1, *channels_first.shape[-3:]))
