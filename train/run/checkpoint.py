@@ -132,8 +132,11 @@ def save(
     for left in folder.glob(".*.tmp"):  # of a process that was killed while it saved
         if left.is_dir() and not left.is_symlink():
             shutil.rmtree(left, ignore_errors=True)
+    progress = {
+        "counters": asdict(counters), "tables": tables, "numpy_rng": rng.bit_generator.state, "episodes": [*episodes],
+    }  # fmt: skip
     try:
-        _write(temporary, agent, learner, rng, counters, tables, run_config, list(episodes))
+        _write(temporary, agent, learner, run_config, progress)
         flush_tree(temporary)
     except OSError:
         shutil.rmtree(temporary, ignore_errors=True)  # it fills the disk
@@ -153,14 +156,7 @@ def save(
 
 
 def _write(
-    temporary: Path,
-    agent: "Agent",
-    learner: "Learner",
-    rng: np.random.Generator,
-    counters: Counters,
-    tables: dict[str, int],
-    run_config: dict[str, Any],
-    episodes: list[int],
+    temporary: Path, agent: "Agent", learner: "Learner", run_config: dict[str, Any], progress: dict[str, Any]
 ) -> None:
     """All files of a checkpoint."""
     model, state = temporary / "pretrained_model", temporary / "training_state"
@@ -173,9 +169,6 @@ def _write(
     # Exploration draws on the policy's device, everything else on the CPU.
     devices = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
     torch.save([torch.get_rng_state(), *devices], state / "torch_rng.pt")
-    progress = {
-        "counters": asdict(counters), "tables": tables, "numpy_rng": rng.bit_generator.state, "episodes": episodes,
-    }  # fmt: skip
     (state / "progress.json").write_text(json.dumps(progress))
 
 
