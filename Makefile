@@ -29,10 +29,11 @@ slow: ## the tests that train for minutes, and the property tests with examples 
 	@CQN_EXAMPLES=random $(RUN) .venv/bin/python -m pytest -m 'slow or hypothesis' --hypothesis-seed=$(SEED) \
 	  -n $(WORKERS) $(SPREAD) --timeout 3600 $(ARGS)
 
-check: ## lint, formatting, types, import rules
+check: ## lint, formatting, types, the reference, import rules
 	@$(RUN) .venv/bin/python -m ruff check .
 	@$(RUN) .venv/bin/python -m ruff format --check .
 	@$(RUN) .venv/bin/python -m mypy
+	@.venv/bin/python docs/reference.py --check
 	@$(RUN) .venv/bin/python -m pytest tests/architecture $(ARGS)
 
 docs: ## the documentation as a site, in build/site; renews docs/configuration.md
