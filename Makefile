@@ -33,7 +33,7 @@ check: ## lint, formatting, types, the reference, import rules
 	@$(RUN) .venv/bin/python -m ruff check .
 	@$(RUN) .venv/bin/python -m ruff format --check .
 	@$(RUN) .venv/bin/python -m mypy
-	@.venv/bin/python docs/reference.py --check
+	@$(RUN) .venv/bin/python docs/reference.py --check
 	@$(RUN) .venv/bin/python -m pytest tests/architecture $(ARGS)
 
 docs: ## the documentation as a site, in build/site; renews docs/configuration.md
