@@ -46,6 +46,7 @@ _RECIPES: dict[str, Recipe] = {
     "paper_dmc_pixels": Recipe(demo_batch_size=0, action_bounds="environment"),
     "laptop_state": Recipe(batch_size=64, demo_batch_size=64),
     "laptop_pixels": Recipe(updates_per_step=0, updates_per_episode=25, batch_size=64, demo_batch_size=64),
+    "practice_state": Recipe(updates_per_step=0, updates_per_episode=25, batch_size=64, demo_batch_size=64),
     "drqv2": Recipe(batch_size=512, demo_batch_size=0, relabel=False, action_bounds="environment"),
 }
 
@@ -63,7 +64,7 @@ class DatasetSettings:
 class EvalSettings:
     """Evaluation episodes: deterministic policy, fixed seeds. On a real arm there are none unless asked for."""
 
-    # environment steps between evaluations, 0: none on the way; None: 1000, on an arm 0
+    # environment steps between evaluations, 0: none on the way; None: 1000 or a tenth of `steps`, on an arm 0
     freq: int | None = number(None, least=0)
     n_episodes: int = number(20, least=1)  # of each evaluation on the way
     # after the offline phase and at the end; None: 50, on an arm 0
@@ -206,7 +207,7 @@ class RunConfig:
     def eval_freq(self) -> int:
         """Environment steps between evaluations, 0 for none."""
         freq = self.eval.freq
-        return freq if freq is not None else 0 if self.robot is not None else 1000
+        return freq if freq is not None else 0 if self.robot is not None else max(1000, self.steps // 10)
 
     @property
     def final_episodes(self) -> int:

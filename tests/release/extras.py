@@ -126,7 +126,7 @@ def _document(environment: Environment, inputs: Path) -> str:
 
 GYMS = (
     ("ur5e_station", "click_button"), ("metaworld_sparse", "drawer-open"), ("hil_sim", "pick_cube"),
-    ("dmc", "cartpole-swingup"), ("pusht_small",), ("aloha_small", "transfer_cube"),
+    ("dmc", "cartpole-swingup"), ("pusht_small",), ("aloha_small", "transfer_cube"), ("so101_sim", "pick_place"),
 )  # fmt: skip
 
 PROBES: dict[str, Extra] = {
@@ -141,6 +141,7 @@ PROBES: dict[str, Extra] = {
     "pusht": _stepping("pusht_small"),
     "aloha": _stepping("aloha_small", "transfer_cube"),
     "dmc": _stepping("dmc", "cartpole-swingup"),
+    "so101": _recording("so101_sim", "pick_place"),
     "gyms": Extra(_gyms, None, "each environment names its own extra"),
     "bench": Extra(_script("bench.py"), _missing_script("bench.py")),
     "page": Extra(_script("page.py"), _missing_script("page.py")),

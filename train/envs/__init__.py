@@ -6,6 +6,7 @@ from .hil_config import HilSimEnv
 from .metaworld_config import MetaworldSparseEnv
 from .pusht_config import PushtSmallEnv
 from .rlbench_config import RLBenchEnv
+from .so101_config import So101SimEnv
 from .ur5e_station.config import UR5eStationEnv
 
 __all__ = [
@@ -15,5 +16,6 @@ __all__ = [
     "MetaworldSparseEnv",
     "PushtSmallEnv",
     "RLBenchEnv",
+    "So101SimEnv",
     "UR5eStationEnv",
 ]
