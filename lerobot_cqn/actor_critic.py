@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .distributional import project_onto_support
+from .distributional import expectation, project_onto_support
 from .losses import demo_mean
 from .model import Features, Model
 from .networks import initialise, projection
@@ -124,10 +124,10 @@ class DrQv2Model(Model):
         total = mean.new_zeros(())
         stats: dict[str, Tensor] = {}
         if s.rl_loss_scale > 0:
-            critic = self._critic_loss(features, batch)
+            critic, td_error = self._critic_loss(features, batch)
             actor = self._actor_loss(_detached(features), mean)
             total = total + s.rl_loss_scale * (critic + actor)
-            stats |= {"rl_loss": critic.detach(), "actor_loss": actor.detach()}
+            stats |= {"rl_loss": critic.detach(), "td_error": td_error, "actor_loss": actor.detach()}
         if s.bc_loss_scale > 0:
             imitation = demo_mean((mean - batch.action).square().mean(-1), batch.demo)
             stats["bc_action_loss"] = imitation.detach()
@@ -135,17 +135,21 @@ class DrQv2Model(Model):
         stats["loss"] = total.detach()
         return total, stats
 
-    def _critic_loss(self, features: Features, batch: Batch) -> Tensor:
-        """Both critics against the target of the lower one: cross-entropy, or squared error with scalar values."""
+    def _critic_loss(self, features: Features, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Both critics against the target of the lower one: cross-entropy, or squared error with scalar values.
+
+        And the mean absolute difference of their values, both scalars.
+        """
         with torch.no_grad():
             target = self.td_target(self.encode(batch.next_observation), batch.reward, batch.discount)[:, None]
         with self.autocast():
             logits = self.critic(features, batch.action)
+        expected = target[..., 0]
         if self.settings.distributional:
-            errors = -(target * F.log_softmax(logits, dim=-1)).sum(-1)
+            errors, expected = -(target * F.log_softmax(logits, dim=-1)).sum(-1), expectation(target, self.support)
         else:
             errors = (logits - target).square().squeeze(-1)
-        return errors.sum(1).mean()
+        return errors.sum(1).mean(), (self.q_values(logits.detach()) - expected).abs().mean()
 
     @torch.no_grad()
     def td_target(self, next_features: Features, reward: Tensor, discount: Tensor) -> Tensor:

@@ -112,14 +112,13 @@ class RLPolicy(PreTrainedPolicy):
         return Observation(views, low_dim.flatten(1))
 
     @torch.no_grad()
+    def act(self, batch: dict[str, Tensor], *, explore: bool = False) -> tuple[Tensor, Tensor]:
+        """Action [B, D] in [-1, 1], with the method's exploration where it is asked for, and its Q [B]."""
+        return self.model.act(self.observe(batch), explore)
+
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
         """Deterministic action [B, D] in [-1, 1]."""
-        return self.model.act(self.observe(batch))[0]
-
-    @torch.no_grad()
-    def explore(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Action [B, D] in [-1, 1] with the method's exploration, and its Q [B]."""
-        return self.model.act(self.observe(batch), explore=True)
+        return self.act(batch)[0]
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """A chunk of one action, [B, 1, D]."""

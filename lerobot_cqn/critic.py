@@ -151,7 +151,8 @@ class CQNModel(Model):
             else:
                 rl = scalar_q_learning_loss(taken[..., 0], target).mean()
             total = total + s.rl_loss_scale * rl
-            stats["rl_loss"] = rl.detach()
+            expected = expectation(target, self.support) if s.distributional else target
+            stats["rl_loss"], stats["td_error"] = rl.detach(), (self.q_values(taken.detach()) - expected).abs().mean()
         if s.bc_loss_scale > 0:
             probs = F.softmax(logits, dim=-1) if s.distributional else logits
             q = expectation(probs, self.support) if s.distributional else logits[..., 0]

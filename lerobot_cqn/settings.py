@@ -129,8 +129,9 @@ PRESETS: dict[str, dict[str, Any]] = {
     "laptop_state": {"frame_stack": 1, "hidden_dim": 256, "lr": 3e-4},
     # Ours: two small cameras on a laptop or one GPU.
     "laptop_pixels": {"frame_stack": 2, "encoder_channels": (16, 32, 64, 64), "hidden_dim": 256, "lr": 1e-4},
-    # Ours: practice from states. A second of history, and RL that weighs as much as imitation (docs/algorithm.md).
-    "practice_state": {"frame_stack": 8, "hidden_dim": 256, "lr": 3e-4, "rl_loss_scale": 1.0},
+    # Ours: practice from states. History that is not squeezed, and RL that weighs as much as imitation
+    # (docs/algorithm.md, "Practice").
+    "practice_state": {"frame_stack": 8, "feature_dim": 256, "hidden_dim": 256, "lr": 3e-4, "rl_loss_scale": 1.0},
 }
 
 

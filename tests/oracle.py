@@ -210,7 +210,7 @@ class Oracle:
         rows = torch.arange(len(action))
         share = 1 / (self.dims * s.levels)
         zero = torch.zeros((), dtype=self.dtype)
-        total, rl, margin, dominance = zero, zero, zero, zero  # A2.11
+        total, rl, margin, dominance, td_error = zero, zero, zero, zero, zero  # A2.11
         _, expert, logits = self.inference("critic", features, action)
         targets = self.target(next_features, reward, discount) if s.rl_loss_scale > 0 else None
         for level in range(s.levels):  # A2.13
@@ -224,6 +224,9 @@ class Oracle:
                     else:
                         rl_here = ((bins[rows, taken, 0] - targets[level][n]) ** 2).mean()
                     rl = rl + share * rl_here
+                    wanted = targets[level][n]
+                    wanted = wanted @ self.atoms if s.distributional else wanted
+                    td_error = td_error + share * (self.mean_value(bins[rows, taken]) - wanted).abs().mean()
                 if s.bc_loss_scale > 0:  # A2.16
                     margin_here = self.demo_mean(self.margin(self.mean_value(bins), taken), batch.demo)
                     margin, bc_here = margin + share * margin_here, margin_here
@@ -232,7 +235,8 @@ class Oracle:
                         dominance_here = self.demo_mean(self.dominance(probs, taken), batch.demo)
                         dominance, bc_here = dominance + share * dominance_here, bc_here + dominance_here
                 total = total + share * (s.rl_loss_scale * rl_here + s.bc_loss_scale * bc_here)  # A2.17
-        parts = {"loss": total, "rl_loss": rl, "bc_margin_loss": margin, "bc_dominance_loss": dominance}
+        parts = {"loss": total, "rl_loss": rl, "td_error": td_error, "bc_margin_loss": margin}
+        parts["bc_dominance_loss"] = dominance
         return total, {name: value.detach() for name, value in parts.items()}
 
     def step(self) -> None:

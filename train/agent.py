@@ -79,12 +79,10 @@ class Agent:
     def _goal_steps(self) -> list[DeltaToGoalProcessorStep]:
         return [step for step in self.postprocessor.steps if isinstance(step, DeltaToGoalProcessorStep)]
 
-    def act(self, prepared: Frame, *, explore: bool) -> tuple[torch.Tensor, float]:
-        """Normalised action [1, D] in [-1, 1] and its mean Q (nan when not exploring)."""
-        if explore:
-            action, q = self.policy.explore(prepared)
-            return action, float(q[0])
-        return self.policy.select_action(prepared), float("nan")
+    def act(self, prepared: Frame, *, explore: bool) -> tuple[torch.Tensor, NDArray[Any]]:
+        """Normalised actions [K, D] in [-1, 1] for K rows, and the mean Q [K] of each."""
+        action, q = self.policy.act(prepared, explore=explore)
+        return action, q.float().cpu().numpy()
 
     def low_dim(self, prepared: Frame) -> NDArray[Any] | None:
         """Normalised state of prepared frames: [K, P], None for pixels-only policies."""

@@ -58,6 +58,7 @@ PRESETS: dict[str, dict[str, str]] = {
         "reference_rlbench": "the authors' implementation where it differs from the paper",
         "laptop_state": "ours: joints and object poses, small network, minutes on one core",
         "laptop_pixels": "ours: two small cameras, a laptop or one GPU",
+        "practice_state": "ours: laptop_state with history and more weight on RL, for long practice",
     },
     "drqv2": {
         "drqv2_plus": "the paper's DrQ-v2+: distributional critic, learns from demonstrations (default)",

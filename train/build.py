@@ -107,7 +107,7 @@ def build(
     def save_checkpoint() -> None:
         save(
             run.output_dir, agent, learner, rng, counters, tables=metrics.sizes(), run_config=draccus.encode(config),
-            episodes=replay.numbers,
+            episodes=[place.number for place in replay.places if place.number >= 0],
         )  # fmt: skip
         begun.unlink(missing_ok=True)
 

@@ -58,10 +58,11 @@ def run(valid: ValidRun) -> int:
             monitor.message(f"Stopped. Continue with: cqn-train --resume=true --output_dir={valid.output_dir}")
             return 130
         monitor.message(f"Policy: {valid.output_dir}/checkpoints/last/pretrained_model")
+        from .run.judgement import practice, read_tables
         from .run.report import write_report
 
         if report := write_report(valid.output_dir):
-            monitor.message(f"Report: {report}")
+            monitor.message(f"{practice(read_tables(valid.output_dir))}\nReport: {report}")
     policy = valid.policy
     if policy.push_to_hub:
         from .push.config import PushConfig

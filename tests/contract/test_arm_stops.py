@@ -40,12 +40,12 @@ class Waving:
 
     def low_dim(self, _: Any) -> None: ...
 
-    def act(self, _: Any, *, explore: bool) -> tuple[Any, float]:
+    def act(self, _: Any, *, explore: bool) -> tuple[Any, Any]:
         assert not explore
         self.steps += 1
         goal = HOME_DEG.copy()
         goal[:2] += 14 * np.sin(self.steps / 8), 10 * np.sin(self.steps / 5)
-        return torch.tensor(goal, dtype=torch.float32)[None], 0.0
+        return torch.tensor(goal, dtype=torch.float32)[None], np.zeros(1)
 
     def postprocessor(self, action: Any) -> Any:
         return action

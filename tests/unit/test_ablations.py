@@ -88,13 +88,13 @@ def test_rl_off_is_the_papers_cbc() -> None:
 
 
 def test_imitation_off() -> None:
-    assert parts("--policy.bc_loss_scale=0").keys() == {"rl_loss", "loss"}
+    assert parts("--policy.bc_loss_scale=0").keys() == {"rl_loss", "td_error", "loss"}
 
 
 def test_scalar_values() -> None:
     made = model("--policy.distributional=false")
     assert made.critic.shape.atoms == 1
-    assert parts("--policy.distributional=false").keys() == {"rl_loss", "bc_margin_loss", "loss"}
+    assert parts("--policy.distributional=false").keys() == {"rl_loss", "td_error", "bc_margin_loss", "loss"}
     assert model().critic.shape.atoms == 51
 
 

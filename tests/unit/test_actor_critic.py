@@ -88,7 +88,7 @@ class Plain:
         return sum((p * z for p, z in zip(out.softmax(0), self.support, strict=True)), out.new_zeros(()))
 
     def loss(self, batch: Batch) -> dict[str, float]:
-        critic = actor = imitation = 0.0
+        critic = td_error = actor = imitation = 0.0
         demos = int(batch.demo.sum())
         for i in range(SIZE):
             reward, discount = float(batch.reward[i]), float(batch.discount[i])
@@ -98,16 +98,21 @@ class Plain:
             lower = min(following, key=lambda out: float(self.value(out)))
             for out in self.critics(self.model.critic, batch.observation, i, batch.action[i].double()):
                 if self.s.distributional:
-                    critic -= float(self.projected(lower.softmax(0), reward, discount) @ out.log_softmax(0))
+                    target = self.projected(lower.softmax(0), reward, discount)
+                    critic -= float(target @ out.log_softmax(0))
+                    wanted = sum(float(p) * z for p, z in zip(target, self.support, strict=True))
                 else:
-                    critic += float((out[0] - reward - discount * lower[0]) ** 2)
+                    wanted = float(reward + discount * lower[0])
+                    critic += (float(out[0]) - wanted) ** 2
+                td_error += abs(float(self.value(out)) - wanted) / 2
             mean = self.actor(batch.observation, i)
             values = self.critics(self.model.critic, batch.observation, i, mean)
             actor -= min(float(self.value(out)) for out in values)
             if batch.demo[i]:
                 imitation += sum(float((mean[d] - batch.action[i, d]) ** 2) for d in range(DIMS)) / DIMS
         return {
-            "rl_loss": critic / SIZE, "actor_loss": actor / SIZE, "bc_action_loss": imitation / max(demos, 1),
+            "rl_loss": critic / SIZE, "td_error": td_error / SIZE, "actor_loss": actor / SIZE,
+            "bc_action_loss": imitation / max(demos, 1),
         }  # fmt: skip
 
     def projected(self, probs: Tensor, reward: float, discount: float) -> Tensor:
@@ -160,7 +165,7 @@ def test_the_actors_gradient_does_not_train_the_critic() -> None:
     model.loss(batch)[0].backward()  # type: ignore[no-untyped-call]
     both = {n: p.grad.clone() for n, p in model.named_parameters() if p.grad is not None and not n.startswith("actor")}
     model.zero_grad()
-    (0.7 * model._critic_loss(model.encode(batch.observation), batch)).backward()
+    (0.7 * model._critic_loss(model.encode(batch.observation), batch)[0]).backward()
     alone = {n: p.grad for n, p in model.named_parameters() if p.grad is not None}
     assert both.keys() == alone.keys()
     assert all(torch.allclose(both[n], alone[n], atol=1e-7) for n in both)

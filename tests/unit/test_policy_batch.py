@@ -58,7 +58,7 @@ def replay_batch(root: Path, agent: Agent, n_step: int, stack: int) -> Batch:
     for episode in Demonstrations(DatasetSettings("local/toy", str(root))).episodes(agent):
         replay.add(episode, demo=True)
     places = [(episode, step) for episode, length in enumerate(LENGTHS) for step in range(length)]
-    return replay._assemble(*(np.array(column) for column in zip(*places, strict=True)))
+    return replay.transitions(*(np.array(column) for column in zip(*places, strict=True)))
 
 
 def assert_same(one: Observation, other: Observation) -> None:

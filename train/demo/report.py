@@ -20,7 +20,7 @@ from lerobot_cqn.modeling_cqn import CQNPolicy
 
 from ..agent import Agent
 from ..envs.ur5e_station.config import UR5eStationEnv
-from ..loop.evaluate import EVAL_SEED, Evaluation, evaluate, wilson_interval
+from ..loop.evaluate import FINAL_SEED, Evaluation, evaluate, wilson_interval
 from ..loop.gym_env import GymEnvironment, OneScene
 from ..run.metrics import read_rows
 from . import figures
@@ -74,7 +74,7 @@ def write_report(config: DemoConfig, labels: Mapping[str, str], wall_s: float) -
 def typical_episode(out: Path, labels: Mapping[str, str], env_config: EnvConfig, look_at: int = 6) -> int:
     """First evaluation episode in which each final policy does what it does in most of the first `look_at`."""
     outcomes = [
-        run_policy(out / name / "checkpoints" / "last" / "pretrained_model", env_config, EVAL_SEED, look_at).outcomes
+        run_policy(out / name / "checkpoints" / "last" / "pretrained_model", env_config, FINAL_SEED, look_at).outcomes
         for name in labels
     ]
     usual = [sum(each) * 2 >= len(each) for each in outcomes]
@@ -83,7 +83,7 @@ def typical_episode(out: Path, labels: Mapping[str, str], env_config: EnvConfig,
 
 def make_films(out: Path, labels: Mapping[str, str], env_config: EnvConfig, pause_share: float) -> dict[str, Frames]:
     """The same scene as demonstrated and as each policy handles it; nothing where the machine cannot draw."""
-    seed = EVAL_SEED + typical_episode(out, labels, env_config)
+    seed = FINAL_SEED + typical_episode(out, labels, env_config)
     try:
         films = {"a demonstration, pauses in": film_demonstration(env_config, pause_share, seed)}
     except Exception as error:  # graphics drivers raise kinds of their own; the numbers must not be lost with them
@@ -100,7 +100,7 @@ def make_films(out: Path, labels: Mapping[str, str], env_config: EnvConfig, paus
 
 def run_expert(config: EnvConfig, episodes: int) -> dict[str, Any]:
     """Success of the scripted operator, without pauses, on the evaluation seeds."""
-    successes = sum(_operate(config, EVAL_SEED + episode, 0.0)[0] for episode in range(episodes))
+    successes = sum(_operate(config, FINAL_SEED + episode, 0.0)[0] for episode in range(episodes))
     low, high = wilson_interval(successes, episodes)
     return {
         "n": episodes, "successes": successes, "success_rate": successes / episodes, "ci_low": low, "ci_high": high,

@@ -1,6 +1,7 @@
 """MuJoCo, imported on first use: the package itself stays importable without a simulator."""
 
 import contextlib
+import importlib
 import os
 import sys
 from collections.abc import Iterator
@@ -9,6 +10,8 @@ from typing import Any
 from lerobot_cqn.errors import ConfigError
 
 __all__ = ["load_mujoco", "needed"]
+
+_CHOOSES = ("mujoco.rendering.classic.gl_context", "mujoco.gl_context")  # the second is all that MuJoCo 3.3 has
 
 
 @contextlib.contextmanager
@@ -36,9 +39,11 @@ def load_mujoco() -> Any:
     Raises:
         ConfigError: mujoco is not installed.
     """
-    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY") and not os.environ.get("MUJOCO_GL"):
         # MuJoCo chooses its GL backend at import; without a screen its default would fail at the first frame.
-        os.environ.setdefault("MUJOCO_GL", "egl")
+        os.environ["MUJOCO_GL"] = "egl"
+        for chosen in (name for name in _CHOOSES if name in sys.modules):
+            importlib.reload(sys.modules[chosen])  # somebody's plugin has imported it, before anybody had chosen
     with needed("Simulated environments need mujoco", "sim"):
         import mujoco
     return mujoco

@@ -1,6 +1,6 @@
 """Success rate of the deterministic policy over fresh episodes, with its 95 % interval."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from math import sqrt
 from typing import Any
@@ -10,27 +10,29 @@ from numpy.typing import NDArray
 
 from ..agent import Agent
 from ..interfaces import Scenes
-from ..replay.standing import stands
+from ..replay.course import Course, Shown, describe
 
-__all__ = ["EVAL_SEED", "Evaluation", "evaluate", "wilson_interval"]
+__all__ = ["EVAL_SEED", "FINAL_SEED", "Evaluation", "evaluate", "wilson_interval"]
 
 # Far from the seeds of training episodes (seed * 100,000 + episode), and the same for every run: variants are compared
 # on equal episodes.
 EVAL_SEED = 2_147_000_000
+# Before and after practice, on the same scenes, which no evaluation on the way has: choosing by those flatters nothing.
+FINAL_SEED = EVAL_SEED + 200_000
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """Result of evaluation episodes.
 
-    outcomes: success; steps: lengths; returns: sums of rewards; standing: steps in which nothing moved; frames:
-    pictures of the first episodes.
+    outcomes: success; steps: lengths; returns: sums of rewards; courses: what the policy saw and did, all episodes
+    alike; frames: pictures of the first episodes.
     """
 
     outcomes: list[bool] = field(default_factory=list)
     steps: list[int] = field(default_factory=list)
     returns: list[float] = field(default_factory=list)
-    standing: list[int] = field(default_factory=list)
+    courses: list[Course] = field(default_factory=list)
     frames: list[list[NDArray[Any]]] = field(default_factory=list)
 
     @property
@@ -56,10 +58,9 @@ class Evaluation:
     @property
     def standing_failures(self) -> float | None:
         """Share of the steps of failed episodes in which nothing moved; None where none failed or there is no state."""
-        failed = [i for i, success in enumerate(self.outcomes) if not success]
-        if not failed or not self.standing:
-            return None
-        return sum(self.standing[i] for i in failed) / max(1, sum(self.steps[i] for i in failed))
+        failed = [(self.steps[i], describe(self.courses[i], Shown())) for i, ok in enumerate(self.outcomes) if not ok]
+        stood = [(steps, said["standing"]) for steps, said in failed if said["standing"] is not None]
+        return sum(steps * share for steps, share in stood) / sum(steps for steps, _ in stood) if stood else None
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -113,9 +114,9 @@ def _wave(agent: Agent, scenes: Scenes, seed: int, film: int, on_step: Callable[
     count = scenes.count
     frame = scenes.reset([seed + k for k in range(count)])
     running, success = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
-    length, standing, total = np.zeros(count, dtype=int), np.zeros(count, dtype=int), np.zeros(count)
+    length, total = np.zeros(count, dtype=int), np.zeros(count)
     films: list[list[NDArray[Any]]] = [[] for _ in range(min(film, count))]
-    before: NDArray[Any] | None = None
+    taken: list[tuple[NDArray[np.bool_], NDArray[Any] | None, NDArray[Any], NDArray[Any]]] = []
 
     def look() -> None:
         pictures = scenes.render() if running[: len(films)].any() else []
@@ -127,15 +128,13 @@ def _wave(agent: Agent, scenes: Scenes, seed: int, film: int, on_step: Callable[
         on_step()
         look()
         prepared = agent.prepare(frame)
-        state = agent.low_dim(prepared)
-        if before is not None and state is not None:
-            standing += running & stands(before, state)
-        before = state
-        action, _ = agent.act(prepared, explore=False)
+        action, value = agent.act(prepared, explore=False)
         outcome = scenes.step(agent.postprocessor(action))
         frame = outcome.frame
         if outcome.skipped:
             agent.retake(first=not length.any())
+        else:
+            taken.append((running.copy(), agent.low_dim(prepared), action.cpu().numpy(), value))
         length += running & (not outcome.skipped)
         total += np.where(running, outcome.reward, 0.0)
         success |= running & outcome.success
@@ -143,5 +142,15 @@ def _wave(agent: Agent, scenes: Scenes, seed: int, film: int, on_step: Callable[
     # The last picture of an episode that ends together with the others; one that ended before has begun anew.
     if count == 1 and films:
         films[0].append(scenes.render()[0])
-    stood = [] if before is None else standing.tolist()
-    return Evaluation(success.tolist(), length.tolist(), total.tolist(), stood, films)
+    courses = [_course([row for row in taken if row[0][k]], k) for k in range(count)]
+    return Evaluation(success.tolist(), length.tolist(), total.tolist(), courses, films)
+
+
+def _course(taken: Sequence[tuple[Any, NDArray[Any] | None, NDArray[Any], NDArray[Any]]], scene: int) -> Course:
+    """What was seen and done in the steps of one scene."""
+    states = [state[scene] for _, state, _, _ in taken if state is not None]
+    return Course(
+        states=np.stack(states) if states else None,
+        actions=np.array([action[scene] for _, _, action, _ in taken]).reshape(len(taken), -1),
+        values=np.array([value[scene] for *_, value in taken]),
+    )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_cqn.errors import OutputError
 from lerobot_cqn.learner import Learner, NonFiniteLossError
@@ -17,18 +18,19 @@ from ..clock import REAL, Clock
 from ..config import RunConfig
 from ..interfaces import Environment, Interrupted, Label, Monitor, Outcome, Person, Scenes
 from ..replay.buffer import Replay
+from ..replay.course import Course, Shown, describe
 from ..replay.demonstrations import counts_as_demonstration
 from ..replay.episode import Episode
 from ..replay.files import Place
 from ..replay.recorder import Recorder
-from ..replay.standing import share_standing
 from ..run.checkpoint import Counters
 from ..run.durable import check_room
 from ..run.first_look import save_batch, write_films
+from ..run.judgement import unconverged
 from ..run.metrics import Metrics, read_rows
-from ..run.report import unconverged
 from .background import Background
-from .evaluate import Evaluation, evaluate
+from .diagnosis import diagnose, episode_rows, shown_in
+from .evaluate import EVAL_SEED, FINAL_SEED, Evaluation, evaluate
 
 __all__ = ["Trainer"]
 
@@ -60,9 +62,10 @@ class Trainer:
     _recent: list[bool] = field(default_factory=list)
     clock: Clock = REAL
     _counted_at: float = field(init=False)
+    _shown: Shown = field(init=False)
 
     def __post_init__(self) -> None:
-        self._counted_at = self.clock.now
+        self._counted_at, self._shown = self.clock.now, shown_in(self.replay)
 
     def run(self) -> None:
         """Offline phase, online phase, final evaluation. Raises Interrupted between two updates or steps."""
@@ -145,7 +148,7 @@ class Trainer:
         frame = self.env.reset(self.config.seed * 100_000 + c.episodes)
         prepared = self.agent.prepare(frame)
         recorder.observe(prepared, frame)
-        q_values: list[float] = []
+        values: list[float] = []
         ended = False
         try:
             with self._background() as agent:
@@ -160,7 +163,7 @@ class Trainer:
                     else:
                         recorder.step(executed, outcome.reward, taught=outcome.taught)
                         recorder.observe(prepared, outcome.frame)
-                        q_values.append(q)
+                        values.append(float(q[0]))
                         c.env_steps += 1
                         self.updates(self.config.recipe.updates_per_step)
                     if self.should_stop():
@@ -170,9 +173,9 @@ class Trainer:
                 ended = True
         finally:
             if ended:  # also where the learner beside it failed: the person's work is not lost
-                self._store(recorder, outcome, float(np.mean(q_values)) if q_values else float("nan"))
+                self._store(recorder, outcome, np.array(values))
 
-    def _store(self, recorder: Recorder, outcome: Outcome, mean_q: float) -> None:
+    def _store(self, recorder: Recorder, outcome: Outcome, values: NDArray[Any]) -> None:
         """Keep a finished episode and say how it went."""
         c, number = self.counters, self.counters.episodes
         c.episodes += 1
@@ -183,7 +186,8 @@ class Trainer:
         demo = counts_as_demonstration(self.config.recipe, success=outcome.success)
         row = {
             "episode": number, "length": len(episode), "success": int(outcome.success),
-            "return": float(episode.reward.sum()), "mean_q": mean_q, "standing": share_standing(episode.low_dim),
+            "return": float(episode.reward.sum()), "mean_q": float(values.mean()),
+            **describe(Course(states=episode.low_dim, actions=episode.action, values=values), self._shown),
             "taught": sum(recorder.taught), "demonstrations": self.replay.demonstrations + demo, **self._progress(),
         }  # fmt: skip
         if outcome.discarded:
@@ -194,7 +198,7 @@ class Trainer:
         self.metrics.write("episodes", row)
         self._recent = [*self._recent, outcome.success][-RECENT:]
         lately = f"success {sum(self._recent)}/{len(self._recent)} lately"
-        self.monitor.advance(c.env_steps, f"episode {c.episodes}  {lately}  Q {mean_q:+.2f}")
+        self.monitor.advance(c.env_steps, f"episode {c.episodes}  {lately}  Q {values.mean():+.2f}")
 
     def _correct(self) -> None:
         """Learn from now on what a person says otherwise about finished episodes."""
@@ -282,11 +286,13 @@ class Trainer:
                 raise Interrupted
 
         self.person.expect(None)
-        films = self.config.eval.videos
-        result = evaluate(self.agent, self.scenes, episodes, on_step=look, film=films)
+        films, seed = self.config.eval.videos, EVAL_SEED if phase == "online" else FINAL_SEED
+        result = evaluate(self.agent, self.scenes, episodes, seed=seed, on_step=look, film=films)
+        rows = episode_rows(result, self._shown, self.scenes.max_steps)
         if films:
             stem = f"{phase}_{self.counters.env_steps:06d}"
-            write_films(result.frames, result.outcomes, self.metrics.output_dir / "videos", stem, self.env.fps)
+            labels = [f"failure {each['how']}".replace(" ", "_") if each["how"] else "success" for each in rows]
+            write_films(result.frames, labels, self.metrics.output_dir / "videos", stem, self.env.fps)
         self.evaluations.append((phase, result))
         low, high = result.interval
         row = {
@@ -295,7 +301,12 @@ class Trainer:
             "mean_length": float(np.mean(result.steps)), "mean_return": result.mean_return,
             "standing_failures": result.standing_failures,
         }  # fmt: skip
-        self.metrics.write("evaluations", row | self._progress())
+        progress = self._progress()
+        self.metrics.write("evaluations", row | progress)
+        for scene, each in enumerate(rows, seed - EVAL_SEED):
+            self.metrics.write("evaluation_episodes", {"phase": phase, "scene": scene, **each, **progress})
+        found = diagnose(self.learner.model, self.replay, self.counters.updates)
+        self.metrics.write("diagnosis", {"phase": phase, **found, **progress})
         self.monitor.message(f"{phase:>8}  step {self.counters.env_steps:>6}  {result}")
 
     def _progress(self) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """Replay buffer: whole episodes, stored once; histories and n-step windows are put together when sampled."""
 
 import json
-from collections.abc import Callable, Collection, Generator
+from collections.abc import Callable, Collection, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -78,9 +78,14 @@ class Replay:
         return len(self._places)
 
     @property
-    def numbers(self) -> list[int]:
-        """Numbers of the run's episodes that are stored."""
-        return [place.number for place in self._places[self._fixed :]]
+    def places(self) -> Sequence[Place]:
+        """Places of all episodes; those of the dataset come first, their `number` is -1."""
+        return tuple(self._places)
+
+    def values(self, name: str, place: Place) -> NDArray[Any]:
+        """What the T steps of an episode hold: `low_dim` [T, P], `action` [T, D] or `reward` [T]."""
+        values: NDArray[Any] = self._rows[name].take(np.arange(place.start, place.stop - 1)).numpy()
+        return values
 
     @property
     def demonstrations(self) -> int:
@@ -189,7 +194,7 @@ class Replay:
         Their pictures lie in memory that is used again: a batch is good until three more have been sampled.
         Raises DataError when a store that is asked for is empty.
         """
-        return self._assemble(*self._draw(count, demo_count, rng))
+        return self.transitions(*self._draw(count, demo_count, rng))
 
     def batches(self, updates: int, count: int, demo_count: int, rng: np.random.Generator) -> Generator[Batch]:
         """`updates` samples, the next one put together while one is in use; errors surface at the next one.
@@ -203,7 +208,7 @@ class Replay:
                     batch = ahead.result() if ahead is not None else self.sample(count, demo_count, rng)
                     before, ahead = rng.bit_generator.state, None
                     if index + 1 < updates:
-                        ahead = pool.submit(self._assemble, *self._draw(count, demo_count, rng))
+                        ahead = pool.submit(self.transitions, *self._draw(count, demo_count, rng))
                     yield batch
             finally:
                 if ahead is not None:  # drawn, but not used
@@ -226,8 +231,8 @@ class Replay:
         episode = np.concatenate(parts)
         return episode, rng.integers(table["first"][episode], table["last"][episode])
 
-    def _assemble(self, episode: NDArray[Any], step: NDArray[Any]) -> Batch:
-        """Transitions at the given steps [B] of the given episodes [B]."""
+    def transitions(self, episode: NDArray[Any], step: NDArray[Any]) -> Batch:
+        """Transitions at the given steps [B] of the given episodes [B], indices among `places`."""
         table = self._table()
         start, length = table["start"][episode], table["length"][episode]
         window = np.minimum(self.n_step, length - step)  # never past the end of the episode

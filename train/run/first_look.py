@@ -146,9 +146,9 @@ def save_batch(batch: Batch, path: Path) -> None:
 
 
 def write_films(
-    films: Sequence[Sequence[NDArray[Any]]], outcomes: Sequence[bool], folder: Path, stem: str, fps: int
+    films: Sequence[Sequence[NDArray[Any]]], labels: Sequence[str], folder: Path, stem: str, fps: int
 ) -> None:
-    """Evaluation episodes as `folder/stem_<number>_<success|failure>.mp4`; pictures uint8 [H, W, 3]."""
+    """Evaluation episodes as `folder/stem_<number>_<label>.mp4`; pictures uint8 [H, W, 3]."""
     folder.mkdir(parents=True, exist_ok=True)
-    for number, (frames, success) in enumerate(zip(films, outcomes, strict=False)):
-        write_video(folder / f"{stem}_{number}_{'success' if success else 'failure'}.mp4", list(frames), fps)
+    for number, (frames, label) in enumerate(zip(films, labels, strict=False)):
+        write_video(folder / f"{stem}_{number}_{label}.mp4", list(frames), fps)

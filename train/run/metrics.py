@@ -11,26 +11,35 @@ __all__ = ["COLUMNS", "Log", "Metrics", "read_rows", "start_tensorboard", "start
 
 Log = Callable[[Mapping[str, float]], Any]
 
+COURSE = ("standing", "at_bounds", "distance", "q_begin", "q_middle", "q_end")  # of an episode
 COLUMNS: dict[str, tuple[str, ...]] = {
     "updates": (
-        "updates", "env_steps", "loss", "rl_loss", "bc_dominance_loss", "bc_margin_loss", "actor_loss",
+        "updates", "env_steps", "loss", "rl_loss", "td_error", "bc_dominance_loss", "bc_margin_loss", "actor_loss",
         "bc_action_loss", "wall_s",
     ),
     "episodes": (
-        "episode", "env_steps", "updates", "length", "success", "return", "mean_q", "standing", "taught",
-        "demonstrations", "wall_s",
+        "episode", "env_steps", "updates", "length", "success", "return", "mean_q", *COURSE, "taught", "demonstrations",
+        "wall_s",
     ),
     "evaluations": (
         "phase", "env_steps", "updates", "episodes", "n", "successes", "success_rate", "ci_low", "ci_high",
         "mean_length", "mean_return", "standing_failures", "wall_s",
     ),
+    "evaluation_episodes": (
+        "phase", "env_steps", "updates", "scene", "success", "how", "length", "return", *COURSE,
+    ),
+    "diagnosis": (
+        "phase", "env_steps", "updates",
+        *(f"{name}_{kind}" for kind in ("demonstrations", "successes", "failures")
+          for name in ("td_error", "rl_gradient", "imitation_gradient")),
+    ),
 }  # fmt: skip
 
 
 class Metrics:
-    """Three tables in `output_dir`: updates.csv, episodes.csv, evaluations.csv (docs/metrics.md).
+    """Tables in `output_dir`, one for each of `COLUMNS` (docs/metrics.md).
 
-    also: called with each row's numbers as `{"<table>/<column>": value}`.
+    also: called with a row's numbers as `{"<table>/<column>": value}`, but for single evaluation episodes.
     """
 
     def __init__(self, output_dir: Path, also: Sequence[Log] = ()) -> None:
@@ -46,7 +55,7 @@ class Metrics:
             writer = csv.DictWriter(file, COLUMNS[table], restval="", extrasaction="ignore")
             writer.writerow({name: _text(value) for name, value in row.items()})
         numbers = {f"{table}/{k}": v for k, v in row.items() if isinstance(v, int | float)}
-        for log in self._also:
+        for log in self._also if table != "evaluation_episodes" else ():
             log(numbers)
 
     def sizes(self) -> dict[str, int]:
