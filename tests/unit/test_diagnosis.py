@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from cqn_train.loop.diagnosis import KINDS, diagnose, shown_in
+from cqn_train.loop.diagnosis import diagnose, shown_in
 from cqn_train.replay.buffer import Replay
 from cqn_train.replay.episode import Episode
+from cqn_train.run.metrics import FORCES, KINDS
 from lerobot_cqn.actor_critic import DrQv2Model
 from lerobot_cqn.critic import CQNModel
 from lerobot_cqn.distributional import expectation
@@ -93,7 +94,7 @@ def test_nothing_of_training_changes(replay, kind):
     assert torch.equal(torch.get_rng_state(), random)
     assert all(torch.equal(value, before[name]) for name, value in made.state_dict().items())
     assert all(p.grad is None for p in made.parameters())
-    assert set(first) == {f"{n}_{k}" for k in KINDS for n in ("td_error", "rl_gradient", "imitation_gradient")}
+    assert set(first) == {f"{n}_{k}" for k in KINDS for n in FORCES}
     assert all(np.isfinite(value) for value in first.values())
 
 

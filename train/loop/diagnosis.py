@@ -13,11 +13,11 @@ from lerobot_cqn.schema import Batch
 from ..replay.buffer import Replay
 from ..replay.course import Shown, describe, how_it_failed
 from ..replay.files import Place
+from ..run.metrics import KINDS
 from .evaluate import Evaluation
 
-__all__ = ["KINDS", "diagnose", "episode_rows", "shown_in"]
+__all__ = ["diagnose", "episode_rows", "shown_in"]
 
-KINDS = ("demonstrations", "successes", "failures")  # of the dataset; and of the run's own episodes
 SAMPLES = 128  # transitions of each kind
 
 

@@ -7,10 +7,12 @@ from typing import Any
 
 from lerobot_cqn.errors import ConfigError
 
-__all__ = ["COLUMNS", "Log", "Metrics", "read_rows", "start_tensorboard", "start_wandb"]
+__all__ = ["COLUMNS", "FORCES", "KINDS", "Log", "Metrics", "read_rows", "start_tensorboard", "start_wandb"]
 
 Log = Callable[[Mapping[str, float]], Any]
 
+KINDS = ("demonstrations", "successes", "failures")  # of transitions: the dataset's, and the run's own episodes'
+FORCES = ("td_error", "rl_gradient", "imitation_gradient")  # on them
 COURSE = ("standing", "at_bounds", "distance", "q_begin", "q_middle", "q_end")  # of an episode
 COLUMNS: dict[str, tuple[str, ...]] = {
     "updates": (
@@ -30,8 +32,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     ),
     "diagnosis": (
         "phase", "env_steps", "updates",
-        *(f"{name}_{kind}" for kind in ("demonstrations", "successes", "failures")
-          for name in ("td_error", "rl_gradient", "imitation_gradient")),
+        *(f"{name}_{kind}" for kind in KINDS for name in FORCES),
     ),
 }  # fmt: skip
 

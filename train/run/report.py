@@ -10,6 +10,7 @@ from lerobot_cqn.errors import ConfigError
 
 from .curve import learning_curve
 from .judgement import Rows, Tables, advice, mean, practice, read_tables
+from .metrics import FORCES, KINDS
 
 __all__ = ["write_report"]
 
@@ -91,10 +92,10 @@ def _groups(rows: Rows) -> Rows:
 
 def _outcomes(rows: Rows) -> Rows:
     """One row for the successes and one for each kind of failure (`how`, where the rows have it)."""
-    kinds = Counter("success" if row["success"] == "1" else row.get("how") or "failure" for row in rows)
+    kinds = ["success" if row["success"] == "1" else row.get("how") or "failure" for row in rows]
     found = []
-    for kind, count in kinds.most_common():
-        group = [row for row in rows if ("success" if row["success"] == "1" else row.get("how") or "failure") == kind]
+    for kind, count in Counter(kinds).most_common():
+        group = [row for row, its in zip(rows, kinds, strict=True) if its == kind]
         columns = (("length", ".0f"), ("standing", ".0%"), ("at_bounds", ".0%"), ("distance", ".2f"),
                    ("q_begin", ".2f"), ("q_middle", ".2f"), ("q_end", ".2f"))  # fmt: skip
         figures = [_figure(mean(group, name), form) for name, form in columns]
@@ -107,10 +108,8 @@ def _forces(rows: Rows) -> Rows:
     if not rows:
         return []
     row, found = rows[-1], []
-    for kind in ("demonstrations", "successes", "failures"):
-        td, rl, imitation = (
-            mean([row], f"{name}_{kind}") for name in ("td_error", "rl_gradient", "imitation_gradient")
-        )
+    for kind in KINDS:
+        td, rl, imitation = (mean([row], f"{name}_{kind}") for name in FORCES)
         if rl is not None or imitation is not None:  # else a kind has no transitions
             share = None if rl is None or imitation is None or not rl + imitation else rl / (rl + imitation)
             figures = [_figure(td, ".3f"), _figure(rl, ".3f"), _figure(imitation, ".3f"), _figure(share, ".0%")]
