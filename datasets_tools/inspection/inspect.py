@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from .cameras import CameraLook
     from .checks import Dataset
     from .finding import Finding
+    from .history import History
     from .numbers import Numbers
 
 __all__ = ["InspectConfig", "Inspection", "help", "inspect_dataset", "main"]
@@ -70,6 +71,7 @@ class Inspection:
     dataset: "Dataset | None" = None
     numbers: "Numbers | None" = None
     cameras: "Sequence[CameraLook]" = ()
+    history: "History | None" = None
 
     @property
     def ok(self) -> bool:
@@ -133,6 +135,7 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
     from .cameras import look, missing_videos
     from .checks import Dataset, findings
     from .finding import by_level
+    from .history import history_finding, measure_history
     from .numbers import measure
     from .places import order, timing
     from .statistics import statistics
@@ -152,6 +155,9 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
 
         line = bar.add_task("Looking at pictures", total=len(source.cameras))
         cameras = look(source, numbers.episodes, moves, lambda: bar.advance(line))
+        line = bar.add_task("Comparing histories", total=1)
+        history = measure_history(source, numbers)
+        bar.advance(line)
     try:
         deltas = source.deltas is not None
     except Exception:  # a damaged history is not what is inspected here
@@ -162,8 +168,9 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
         *statistics(source, numbers),
         *order(source),
         *timing(source, numbers),
+        *history_finding(history),
     ]
-    return Inspection(sorted(found, key=by_level), dataset, numbers, cameras)
+    return Inspection(sorted(found, key=by_level), dataset, numbers, cameras, history)
 
 
 def _write_page(path: Path, inspection: Inspection) -> None:
@@ -172,7 +179,7 @@ def _write_page(path: Path, inspection: Inspection) -> None:
 
     if inspection.dataset is None or inspection.numbers is None:
         return
-    text = page(inspection.dataset, inspection.numbers, inspection.cameras, inspection.findings)
+    text = page(inspection.dataset, inspection.numbers, inspection.cameras, inspection.findings, inspection.history)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with path.open("x", encoding="utf-8") as file:
@@ -195,7 +202,9 @@ def _show(inspection: Inspection) -> None:
     if found is not None and found.steps:
         result(f"Threshold {found.threshold:g}: {found.reason}")
         result("Still steps at " + ", ".join(f"{a.threshold:g}: {a.share:.0%}" for a in found.alternatives))
-    for line in filter(None, [sentence_of_actions(numbers)]):
+    for line in filter(
+        None, [sentence_of_actions(numbers), inspection.history.sentence() if inspection.history else None]
+    ):
         result(line)
     needed = memory(numbers, inspection.cameras)
     pictures = (
@@ -277,6 +286,21 @@ def as_json(repo_id: str, inspection: Inspection) -> dict[str, Any]:
             "lag_steps": lag[0] if lag else None,
             "lag_correlation": _round(lag[1]) if lag else None,
             "mean_gap": [_round(g) for g in follow.gap()],
+        },
+        "history": None
+        if inspection.history is None
+        else {
+            "columns": list(inspection.history.columns),
+            "advised_frames": inspection.history.advised(),
+            "unexplained": [
+                {
+                    "frames": f,
+                    "stride": s,
+                    "mean": _round(inspection.history.mean(f, s)),
+                    "each": [_round(float(v)) for v in shares],
+                }
+                for (f, s), shares in inspection.history.shares.items()
+            ],
         },
         "episodes": [
             {

@@ -10,6 +10,7 @@ from lerobot_cqn.schema import STATE
 from .cameras import CameraLook
 from .checks import PAPER_SIZE, Dataset, memory
 from .finding import LEVELS, Finding
+from .history import FRAMES, STRIDES, History
 from .numbers import Dimension, EpisodeNumbers, Numbers
 from .svg import pauses, spark, still_share, threshold_histogram
 
@@ -62,7 +63,13 @@ figure.below { margin-top: 1.5rem; }
 """
 
 
-def page(dataset: Dataset, numbers: Numbers, cameras: Sequence[CameraLook], found: Sequence[Finding]) -> str:
+def page(
+    dataset: Dataset,
+    numbers: Numbers,
+    cameras: Sequence[CameraLook],
+    found: Sequence[Finding],
+    history: History | None = None,
+) -> str:
     """The whole document; every name from the dataset is escaped."""
     name = html.escape(dataset.repo_id)
     body = [
@@ -73,6 +80,7 @@ def page(dataset: Dataset, numbers: Numbers, cameras: Sequence[CameraLook], foun
         _pauses(numbers),
         _episodes(dataset, numbers),
         _dimensions(numbers),
+        _history(history),
         _cameras(cameras),
         _memory(numbers, cameras),
     ]
@@ -215,6 +223,22 @@ def _dimensions(numbers: Numbers) -> str:
         table = f"<table>{head}{rows(numbers.of(column))}</table>"
         parts.append(f"<p><b>{html.escape(column)}</b></p><div class='scroll'>{table}</div>")
     return "\n".join(parts)
+
+
+def _history(history: History | None) -> str:
+    if history is None:
+        return ""
+    head = "<tr><th>frames</th>" + "".join(f"<th>{s} step{'s' * (s > 1)} apart</th>" for s in STRIDES) + "</tr>"
+    rows = "".join(
+        _row([f, *(f"{history.mean(f, s):.1%}" if (f, s) in history.shares else "" for s in STRIDES)]) for f in FRAMES
+    )
+    note = (
+        f"Share of the actions' variance that small regressions on {' and '.join(history.columns)} leave unexplained"
+        " on episodes they have not seen. A policy sees frames one step apart (--policy.frame_stack)."
+    )
+    return (
+        f"<h2>History</h2><p class='soft'>{html.escape(note)}</p><div class='scroll'><table>{head}{rows}</table></div>"
+    )
 
 
 def _cameras(cameras: Sequence[CameraLook]) -> str:
