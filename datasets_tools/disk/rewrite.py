@@ -9,6 +9,7 @@ from typing import Any
 
 import datasets
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets.compute_stats import aggregate_stats, compute_episode_stats
@@ -54,13 +55,17 @@ def rewrite(view: View, source: Source, root: Path, bar: Progress) -> None:
     with new_folder(root) as folder:
         _copy_rest(source.root, folder, bar)
         stats, places = _write_numbers(view, source, folder, bar)
-        _write_episodes(source, folder, stats, places)
-        _write_tasks(source, folder)
+        numbers = _task_numbers(view, source)
+        _write_episodes(view, source, folder, stats, places)
+        pd.DataFrame({"task_index": range(len(numbers))}, index=pd.Index(numbers, name="task")).to_parquet(
+            folder / "meta/tasks.parquet"
+        )
         known = source.meta.stats or _from_episodes(source)
         old = {k: v for k, v in known.items() if k in view.features or "." not in k}
         write_stats({**old, **aggregate_stats(list(stats.values()))}, folder)
         info = json.loads((source.root / "meta/info.json").read_text())
         own = {k: v for k, v in info["features"].items() if k not in source.features}
+        info["total_tasks"] = len(numbers)
         info["features"] = {**_plain(all_features(view)), **own}
         (folder / "meta/info.json").write_text(json.dumps(info, indent=4) + "\n")
         view.settle(view.episodes)
@@ -107,7 +112,7 @@ def _write_numbers(view: View, source: Source, folder: Path, bar: Progress) -> t
     features = {**source.meta.features, **all_features(view)}
     schema = get_hf_features_from_features(features)
     numbers = {k: f for k, f in all_features(view).items() if f["dtype"] not in NOT_NUMBERS}
-    tasks = {number: place for place, number in enumerate(sorted(source.tasks))}
+    tasks = _task_numbers(view, source)
     stats: dict[int, Stats] = {}
     places: Places = {}
     written = 0
@@ -135,7 +140,7 @@ def _write_numbers(view: View, source: Source, folder: Path, bar: Progress) -> t
         new = {k: table[k] for k in numbers} | {
             "timestamp": pa.array(times, pa.float32()),
             "index": pa.array(range(written, written + len(times)), pa.int64()),
-            "task_index": pa.array([tasks[n] for n in old["task_index"].to_pylist()], pa.int64()),
+            "task_index": pa.array([tasks[t] for i in episodes for t in view.episode(i).tasks], pa.int64()),
         }
         arrays = [new[k] if k in new else old[k] for k in schema]
         written += len(times)
@@ -150,14 +155,15 @@ def _partition(source: Source) -> Iterator[tuple[Path, list[int]]]:
         yield path, list(episodes)
 
 
-def _write_tasks(source: Source, folder: Path) -> None:
-    """The tasks by their number, from 0: LeRobot takes the one in that place of the table."""
-    ordered = source.meta.tasks.sort_values("task_index")
-    ordered["task_index"] = range(len(ordered))
-    ordered.to_parquet(folder / "meta/tasks.parquet")
+def _task_numbers(view: View, source: Source) -> dict[str, int]:
+    """Each task with its number, from 0: LeRobot takes the one in that place of the table. The source's order stays."""
+    known = [source.tasks[number] for number in sorted(source.tasks)]
+    used = dict.fromkeys(task for index in view.episodes for task in view.episode(index).tasks)
+    kept = known if used.keys() <= set(known) else [task for task in known if task in used]
+    return {task: number for number, task in enumerate(dict.fromkeys([*kept, *used]))}
 
 
-def _write_episodes(source: Source, folder: Path, stats: dict[int, Stats], places: Places) -> None:
+def _write_episodes(view: View, source: Source, folder: Path, stats: dict[int, Stats], places: Places) -> None:
     """The episodes' metadata with the new statistics and places; all other columns stay."""
     for path in sorted((source.root / "meta/episodes").rglob("*.parquet")):
         table = pq.read_table(path)
@@ -165,6 +171,7 @@ def _write_episodes(source: Source, folder: Path, stats: dict[int, Stats], place
         new = {f"stats/{key}/{name}": [np.asarray(stats[i][key][name]).tolist() for i in numbers]
                for key, kinds in stats[numbers[0]].items() for name in kinds}  # fmt: skip
         new |= {name: [places[i][name] for i in numbers] for name in places[numbers[0]]}
+        new["tasks"] = [list(dict.fromkeys(view.episode(i).tasks)) for i in numbers]
         for name, values in new.items():
             if name in table.column_names:
                 table = table.set_column(table.column_names.index(name), name, pa.array(values))

@@ -200,21 +200,21 @@ class Source(View):
         """
         worst = 0.0
         for key in self.meta.video_keys:
-            path, offset = self.video_path(index, key), self._span(index, key)[0]
+            path, offset = self.video_path(index, key), self.span(index, key)[0]
             if path not in self._picture_times:
                 self._picture_times[path] = picture_times(path)
             apart = distances(path, self._picture_times[path], offset + times, self.fps, index)
             worst = max(worst, float(apart.max()))
         return worst
 
-    def _span(self, index: int, key: str) -> tuple[float, float]:
+    def span(self, index: int, key: str) -> tuple[float, float]:
         """Seconds in the file of a camera between which an episode's pictures lie."""
         row = self.meta.episodes[index]
         return float(row[f"videos/{key}/from_timestamp"]), float(row[f"videos/{key}/to_timestamp"])
 
     def _pictures_in(self, index: int) -> int | None:
         """How many pictures each camera has of an episode; None without videos, -1 where they do not agree."""
-        spans = (self._span(index, key) for key in self.meta.video_keys)
+        spans = (self.span(index, key) for key in self.meta.video_keys)
         found = {round((stop - start) * self.fps) for start, stop in spans}
         return None if not found else found.pop() if len(found) == 1 else -1
 
@@ -238,7 +238,7 @@ class Source(View):
 
     def _video(self, episode: Episode, key: str, steps: NDArray[np.int64]) -> Iterator[Decoded]:
         """Pictures of a camera; raises DataError for rows beyond them, another size, or other colours than before."""
-        (offset, end), path = self._span(episode.index, key), self.video_path(episode.index, key)
+        (offset, end), path = self.span(episode.index, key), self.video_path(episode.index, key)
         times, declared = offset + episode.times[steps], picture_size(self.features[key])
         beyond = np.flatnonzero(times > end - 0.5 / self.fps)
         if len(beyond):

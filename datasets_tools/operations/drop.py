@@ -10,6 +10,7 @@ from lerobot_cqn.history_text import numbered
 from ..terminal.console import result, table
 from ..terminal.options import option
 from .job import Step, settings_of
+from .parts import known_episodes
 
 if TYPE_CHECKING:
     from ..views.view import DerivedView, View
@@ -53,11 +54,7 @@ observation.state[gripper.pos], followed by .first, .last, .min, .max, .mean or 
         from ..decisions.episode_rules import parse_rule
         from ..views.selected import Selected
 
-        unknown = sorted(set(self.episodes) - set(view.episodes))
-        if unknown:
-            raise ConfigError(
-                f"No episode {unknown[0]}: expected numbers from {min(view.episodes)} to {max(view.episodes)}."
-            )
+        known_episodes(view, self.episodes)
         rule = parse_rule(self.where, view.features) if self.where else None
         dropped: dict[int, str] = {}
         after = Selected(view)

@@ -13,6 +13,7 @@ from ..disk.folders import refuse_existing
 from ..terminal.console import note, result, table
 from ..terminal.options import option
 from .job import Step, settings_of
+from .parts import known_episodes
 
 if TYPE_CHECKING:
     from ..decisions.pauses import EpisodeReport, Rule
@@ -46,6 +47,10 @@ Delta actions are formed anew, so that they connect the states that are left.
         default_factory=dict,
         metadata={"help": """Other thresholds for single joints, e.g. '{"wrist_roll.pos": 1.5}'."""},
     )
+    episode_thresholds: dict[int, float] = dataclasses.field(
+        default_factory=dict,
+        metadata={"help": """Other thresholds for single episodes, e.g. '{"3": 0.01}'; 0 keeps all of its steps."""},
+    )
     gripper_threshold: float | None = option(
         None, help="A gripper that changed more is an event; by default the threshold."
     )
@@ -75,6 +80,9 @@ Delta actions are formed anew, so that they connect the states that are left.
         for name, value in thresholds:
             if not 0 < value < float("inf"):
                 raise ConfigError(f"Expected a positive, finite threshold for '{name}', got {value}.")
+        for index, value in self.episode_thresholds.items():
+            if not 0 <= value < float("inf"):
+                raise ConfigError(f"Expected a finite --episode_thresholds >= 0 for episode {index}, got {value}.")
         if self.auto and self.threshold is not None:
             raise ConfigError("--auto chooses the threshold and --threshold gives one: expected only one of them.")
         if self.gripper_threshold is not None and not self.gripper_threshold >= 0:
@@ -94,7 +102,9 @@ Delta actions are formed anew, so that they connect the states that are left.
         from ..views.selected import filtered_view
 
         rule, why = self.rule(view)
-        after, reports = filtered_view(view, rule, self.min_steps, skip=self.skip_short)
+        known_episodes(view, self.episode_thresholds)
+        rules = {index: self.rule_of(view, index, rule) for index in self.episode_thresholds}
+        after, reports = filtered_view(view, rule, self.min_steps, skip=self.skip_short, rules=rules)
         _show(reports)
         self._advise(view, reports)
         if self.preview:
@@ -125,10 +135,42 @@ Delta actions are formed anew, so that they connect the states that are left.
             f" nothing moves: below {shown(settings['threshold'])} a step.{why}{short}"
         )
 
+    def rule_of(self, view: "View", index: int, rule: "Rule") -> "Rule":
+        """The rule for one episode: with its own threshold in place of the common one."""
+        if index not in self.episode_thresholds:
+            return rule
+        names, own = dimension_names(view.features[STATE]), self.episode_thresholds[index]
+        return dataclasses.replace(
+            rule, thresholds=tuple(self.joint_thresholds.get(names[i], own) for i in rule.joints)
+        )
+
     def rule(self, view: "View") -> "tuple[Rule, dict[str, Any]]":
-        """Rule of what a pause is in this dataset, and reasons for an automatic threshold."""
+        """Rule of what a pause is in this dataset, and reasons for an automatic threshold; says what it goes by."""
+        from ..decisions.pauses import DRIVES
+
+        why: dict[str, Any] = {}
+        rule = self.rule_at(view, 0.005 if self.threshold is None else self.threshold)
+        if not rule.gripper_state and not rule.gripper_action:
+            note('No dimension is named "gripper", so gripper changes are not protected; name it with --gripper_names.')
+        if self.auto:
+            threshold, why = _choose(view, rule.joints)
+            rule = self.rule_at(view, threshold)
+        if rule.rates_state or rule.rates_action:
+            states, actions = (dimension_names(view.features[k]) for k in (STATE, ACTION))
+            names = [states[i] for i in rule.rates_state] + [actions[i] for i in rule.rates_action]
+            named = ", ".join(dict.fromkeys(names))
+            note(f"Velocities: {named}; a step at which one is above {DRIVES:.0%} of its largest value is no pause.")
+        return rule, why
+
+    def rule_at(self, view: "View", threshold: float) -> "Rule":
+        """Rule of what a pause is in this dataset at a threshold.
+
+        Raises:
+            ConfigError: a joint or gripper is named that is not there.
+            DataError: there are no states or no actions.
+        """
         from ..decisions.joints import gripper_dims, rate_dims
-        from ..decisions.pauses import DRIVES, Rule
+        from ..decisions.pauses import Rule
 
         for key in (STATE, ACTION):
             if key not in view.features:
@@ -148,15 +190,6 @@ Delta actions are formed anew, so that they connect the states that are left.
         for name in self.joint_thresholds:
             if name not in known:
                 raise ConfigError(one_of("joint", name, known))
-        if not gripper_state and not gripper_action:
-            note('No dimension is named "gripper", so gripper changes are not protected; name it with --gripper_names.')
-        threshold = 0.005 if self.threshold is None else self.threshold
-        why: dict[str, Any] = {}
-        if self.auto:
-            threshold, why = _choose(view, joints)
-        if rates_state or rates_action:
-            named = ", ".join(dict.fromkeys([states[i] for i in rates_state] + [actions[i] for i in rates_action]))
-            note(f"Velocities: {named}; a step at which one is above {DRIVES:.0%} of its largest value is no pause.")
         return Rule(
             joints=joints,
             thresholds=tuple(self.joint_thresholds.get(states[i], threshold) for i in joints),
@@ -171,7 +204,7 @@ Delta actions are formed anew, so that they connect the states that are left.
             limits_state=self._limits(view, STATE, rates_state, states),
             rates_action=rates_action,
             limits_action=self._limits(view, ACTION, rates_action, actions),
-        ), why
+        )
 
     def _limits(self, view: "View", column: str, rates: tuple[int, ...], names: list[str]) -> tuple[float, ...]:
         """For each velocity the value above which something moves: as asked for, else a share of the largest one."""

@@ -10,6 +10,7 @@ from lerobot_cqn.history_text import numbered
 from ..terminal.console import note, table
 from ..terminal.options import option
 from .job import Step, settings_of
+from .parts import known_episodes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -94,11 +95,7 @@ Videos are copied as they are. Rules: QUANTITY OPERATOR NUMBER, see drop --help.
             if column not in numbers:
                 raise ConfigError(one_of("column", column, numbers))
             return lambda episode: bool((np.asarray(episode.columns[column]) > 0).any())
-        for number in [*self.episodes, *self.failed]:
-            if number not in view.episodes:
-                raise ConfigError(
-                    f"No episode {number}: expected numbers from {min(view.episodes)} to {max(view.episodes)}."
-                )
+        known_episodes(view, [*self.episodes, *self.failed])
         if self.failed:
             return lambda episode: episode.index not in self.failed
         return lambda episode: self.all or episode.index in self.episodes

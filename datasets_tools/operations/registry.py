@@ -37,6 +37,9 @@ OPERATIONS = {
     "inspect": Operation(
         "look at a dataset before training: pauses, cameras, outliers, what is missing", "inspection.inspect"
     ),
+    "review": Operation(
+        "look at a recording on a page: cut, label, drop and name episodes, see which pauses go", "review.review"
+    ),
     "record": Operation("record scripted demonstrations in an environment, as teleoperation would", "record"),
     "filter": Operation("leave out the time steps in which nothing moves", "operations.filter", "Filter"),
     "trim": Operation("cut heads and tails of episodes", "operations.trim", "Trim"),
@@ -44,6 +47,7 @@ OPERATIONS = {
     "resample": Operation("take fewer steps a second", "operations.resample", "Resample"),
     "resize": Operation("scale the pictures, and cut them out first where asked", "operations.resize", "Resize"),
     "label": Operation("write sparse rewards: 1 on the last step of successful episodes", "operations.label", "Label"),
+    "task": Operation("say in words what the episodes show", "operations.task", "Task"),
     "bounds": Operation("set the action bounds that training scales by", "operations.bounds", "SetBounds"),
     "drop": Operation("leave out whole episodes, by number or by rule", "operations.drop", "Drop"),
     "run": Operation("run several of these as one pass over the videos, from a recipe", "operations.recipe"),

@@ -10,6 +10,7 @@ from lerobot_cqn.schema import ACTION, NEXT_REWARD, NEXT_SUCCESS, STATE
 from ..terminal.console import table
 from ..terminal.options import option
 from .job import Step, settings_of
+from .parts import known_episodes
 
 if TYPE_CHECKING:
     from ..views.episode import Episode
@@ -28,13 +29,21 @@ cqn-data trim --repo_id=local/click --root=data/click --new_root=data/click_trim
 cqn-data trim --repo_id=local/click --root=data/click --head_seconds=0.5 --tail=3 --dry_run
 """
     notes = """
-First --after_success, then --head and --tail, then --motion. A part that carries a reward is never cut off.
+First --after_success, then --head and --tail (or the episode's --cuts), then --motion. A part that carries a reward or
+an end is only cut off with --cut_rewards.
 """
 
     head: int = option(0, help="Steps to cut at the start.")
     tail: int = option(0, help="Steps to cut at the end.")
     head_seconds: float = option(0.0, help="Seconds to cut at the start, instead of --head.")
     tail_seconds: float = option(0.0, help="Seconds to cut at the end, instead of --tail.")
+    cuts: dict[int, list[int]] = dataclasses.field(
+        default_factory=dict,
+        metadata={
+            "help": """Steps to cut at start and end of single episodes, e.g. '{"3": [12, 5]}', instead of those."""
+        },
+    )
+    cut_rewards: bool = option(False, help="Cut off rewards and ends, too: a label step writes them anew after it.")
     motion: bool = option(False, help="Cut until the first motion and after the last one.")
     keep_still: int = option(0, help="Still steps that --motion leaves at either end; some teach to settle.")
     threshold: float | None = option(None, help="A joint that moved less is still, as in filter; for --motion.")
@@ -49,11 +58,16 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
                 raise ConfigError(f"Expected --{name} >= 0, got {getattr(self, name)}.")
         if (self.head and self.head_seconds) or (self.tail and self.tail_seconds):
             raise ConfigError("Expected steps or seconds for an end, got both.")
+        for index, cut in self.cuts.items():
+            if len(cut) != 2 or min(cut) < 0:
+                raise ConfigError(f"Expected --cuts of [start, end], both >= 0, for episode {index}, got {cut}.")
         if self.min_steps < 1:
             raise ConfigError(f"Expected --min_steps >= 1, got {self.min_steps}.")
-        asked = (self.head, self.tail, self.head_seconds, self.tail_seconds, self.motion, self.after_success)
+        asked = (self.head, self.tail, self.head_seconds, self.tail_seconds, self.motion, self.after_success, self.cuts)
         if not any(asked):
-            raise ConfigError("Nothing to trim: give --head, --tail, their seconds, --motion or --after_success.")
+            raise ConfigError(
+                "Nothing to trim: give --head, --tail, their seconds, --cuts, --motion or --after_success."
+            )
         self._motion().validate()
 
     def _motion(self) -> Any:
@@ -77,13 +91,15 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
                 f"--after_success needs a column {NEXT_SUCCESS} or {NEXT_REWARD}; label the dataset first."
             )
         rule = self._motion().rule(view)[0] if self.motion else None
+        known_episodes(view, self.cuts)
+        common = self.head or round(self.head_seconds * view.fps), self.tail or round(self.tail_seconds * view.fps)
         after, cut = Selected(view), []
         for index in view.episodes:
             episode = view.episode(index)
             start, success = 0, self._success(episode)
             stop = len(episode) if success is None else success + 1
-            start += self.head or round(self.head_seconds * view.fps)
-            stop -= self.tail or round(self.tail_seconds * view.fps)
+            head, tail = self.cuts.get(index, common)
+            start, stop = start + head, stop - tail
             if rule is not None and stop - start > 1:
                 start, stop = self._moving(episode, start, stop, rule)
             lost = carries_reward(episode.columns, len(episode))
@@ -95,10 +111,10 @@ First --after_success, then --head and --tail, then --motion. A part that carrie
                     f"Only {max(0, stop - start)} of {len(episode)} steps would be left of episode {index}; expected at"
                     f" least --min_steps={self.min_steps}. Trim less, or drop it."
                 )
-            if lost.any():
+            if lost.any() and not self.cut_rewards:
                 raise DataError(
                     f"Episode {index}, frame {int(np.flatnonzero(lost)[0])} carries a reward or an end and would be cut"
-                    " off; trim less, or trim before labelling."
+                    " off; trim less, or --cut_rewards and label the result."
                 )
             after.rows[index] = np.arange(start, stop)
             cut.append([index, len(episode), stop - start, start, len(episode) - stop])

@@ -1,7 +1,8 @@
 """Views of some rows of some episodes, such as those without the pauses."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -82,12 +83,15 @@ def _in_dtype(values: NDArray[Any], episode: Episode) -> NDArray[Any]:
     return values.astype(dtype)
 
 
-def filtered_view(view: View, rule: Rule, min_steps: int, *, skip: bool) -> tuple[Selected, list[EpisodeReport]]:
-    """Apply ``rule`` to all episodes.
+def filtered_view(
+    view: View, rule: Rule, min_steps: int, *, skip: bool, rules: Mapping[int, Rule] = MappingProxyType({})
+) -> tuple[Selected, list[EpisodeReport]]:
+    """Apply ``rule`` to all episodes but those that have one of their own in ``rules``.
 
     Args:
         view: the view before.
         rule: what a pause is.
+        rules: the same by episode.
         min_steps: an episode that keeps fewer steps, and had as many, is refused.
         skip: leave such episodes out instead.
 
@@ -98,8 +102,9 @@ def filtered_view(view: View, rule: Rule, min_steps: int, *, skip: bool) -> tupl
     for index in view.episodes:
         episode = view.episode(index)
         state, action = episode.columns[STATE], episode.columns[ACTION]
-        mask = keep_mask(state, action, rule, carries_reward(episode.columns, len(episode)))
-        report = report_episode(index, state, action, mask, rule, commanded_joints(view, episode))
+        own = rules.get(index, rule)
+        mask = keep_mask(state, action, own, carries_reward(episode.columns, len(episode)))
+        report = report_episode(index, state, action, mask, own, commanded_joints(view, episode))
         reports.append(report)
         if report.kept < min(min_steps, report.steps):
             short.append(report)

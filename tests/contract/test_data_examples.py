@@ -17,7 +17,8 @@ from .. import foreign_formats
 from .data_recording import RECIPE
 
 NAMES = ["pan.pos", "lift.pos", "gripper.pos"]
-ELSEWHERE = {"push", "record"}  # the network; and a minute of simulation, which the walk through the docs has
+# The network; a minute of simulation, which the walk through the docs has; a page that waits for a person.
+ELSEWHERE = {"push", "record", "review"}
 OUTPUTS = ("--new_root", "--html", "--preview", "--report")
 
 

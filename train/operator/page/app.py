@@ -1,47 +1,33 @@
-"""The routes of the operator's page. Everything but the page itself passes the token first (access.py)."""
+"""The routes of the operator's page. Everything but the page itself passes the token first (`cqn_data.web.access`)."""
 
 import asyncio
 import contextlib
-import json
 import re
 from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lerobot_cqn.errors import ConfigError
+from cqn_data.web import routes as web
+from cqn_data.web.access import Guard
+from cqn_data.web.routes import MAX_BODY, NonsenseError, add_errors, add_files, body, check, error, parsed
 
 from ..board import Board
 from ..control import Control, ViewingOnlyError
 from ..session import BY_ITSELF, Event, Label, RefusedError
-from .access import Guard
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
 
-__all__ = ["make_app", "need_extra"]
+__all__ = ["MAX_BODY", "make_app", "need_extra"]
 
-MAX_BODY = 4096  # bytes of a request or message
 MAX_PAGES = 16  # that are open at once
 PUSH_S = 0.5  # between two snapshots where nothing happens
 CLIENT = re.compile(r"[A-Za-z0-9_-]{1,64}")
-KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
-
-
-class _NonsenseError(ValueError):
-    """A message that cannot be understood; the error says what was expected."""
 
 
 def need_extra() -> None:
     """Raises ConfigError where the packages of the page are missing."""
-    try:
-        import fastapi  # noqa: F401
-        import uvicorn  # noqa: F401
-        import websockets  # noqa: F401
-    except ImportError as error:
-        raise ConfigError(
-            f"The operator's page needs the package {error.name}: pip install 'lerobot_policy_cqn[page]', "
-            "or steer with the keys of the terminal."
-        ) from error
+    web.need_extra("The operator's page", ", or steer with the keys of the terminal")
 
 
 def make_app(
@@ -80,48 +66,17 @@ def make_app(
 
     app = FastAPI(lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None, redirect_slashes=False)
     app.state.control = control
-    _add_errors(app)
+    add_errors(app, {ViewingOnlyError: 403, RefusedError: 409})
     _add_actions(app, board, control, wake)
     _add_pictures(app, board)
     _add_socket(app, board, control, pages, wake)
-    app.state.public = _add_files(app)
+    app.state.public = add_files(app, Path(__file__).parent / "static")
     app.add_middleware(Guard, token=token, host=host, public=app.state.public)
     return app
 
 
 def _later(loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> None:
     loop.call_soon_threadsafe(call)
-
-
-def _error(status: int, text: str) -> Any:
-    from fastapi.responses import JSONResponse
-
-    return JSONResponse({"error": " ".join(text.split())}, status)
-
-
-def _add_errors(app: "FastAPI") -> None:
-    """Answers of one line to all that is refused."""
-    from fastapi.exceptions import RequestValidationError
-    from starlette.exceptions import HTTPException
-
-    def handle(kind: type[Exception], status: int) -> None:
-        async def answer(_: Any, problem: Exception) -> Any:
-            return _error(status, str(problem))
-
-        app.add_exception_handler(kind, answer)
-
-    async def not_found(_: Any, problem: Exception) -> Any:
-        return _error(getattr(problem, "status_code", 400), str(getattr(problem, "detail", problem)))
-
-    async def invalid(_: Any, problem: Exception) -> Any:
-        found = problem.errors() if isinstance(problem, RequestValidationError) else []
-        return _error(422, "; ".join(f"{entry['loc'][-1]}: {entry['msg']}" for entry in found))
-
-    app.add_exception_handler(HTTPException, not_found)
-    app.add_exception_handler(RequestValidationError, invalid)
-    handle(_NonsenseError, 422)
-    handle(ViewingOnlyError, 403)
-    handle(RefusedError, 409)
 
 
 def _add_actions(app: "FastAPI", board: Board, control: Control, wake: Callable[[], None]) -> None:
@@ -138,30 +93,30 @@ def _add_actions(app: "FastAPI", board: Board, control: Control, wake: Callable[
 
     @app.post("/api/event")
     async def _(request: Request) -> JSONResponse:
-        given = await _body(request, {"event": str})
+        given = await body(request, {"event": str})
         event = _event(given["event"])
         client = None
         try:
             client = _client(request.query_params, request.headers)
-        except _NonsenseError:
+        except NonsenseError:
             if event is not Event.STOP:  # whoever asks for it, however badly
                 raise
         return JSONResponse({"ok": True, "state": str(control.apply(client, event))})
 
     @app.post("/api/correct")
     async def _(request: Request) -> JSONResponse:
-        given = await _body(request, {"episode": int, "label": str})
+        given = await body(request, {"episode": int, "label": str})
         if given["label"] not in list(Label):
-            raise _NonsenseError(f"Unknown label {given['label'][:40]!r}: expected one of {', '.join(Label)}.")
+            raise NonsenseError(f"Unknown label {given['label'][:40]!r}: expected one of {', '.join(Label)}.")
         control.correct(_client(request.query_params, request.headers), given["episode"], Label(given["label"]))
         return JSONResponse({"ok": True})
 
     @app.post("/api/control")
     async def _(request: Request) -> JSONResponse:
-        await _body(request, {})
+        await body(request, {})
         client = _client(request.query_params, request.headers)
         if client is None:
-            raise _NonsenseError("Say who takes control: expected `client=` in the query.")
+            raise NonsenseError("Say who takes control: expected `client=` in the query.")
         control.take(client)
         wake()
         return JSONResponse({"ok": True})
@@ -173,7 +128,7 @@ def _add_pictures(app: "FastAPI", board: Board) -> None:
     from fastapi.responses import JSONResponse
 
     def jpeg(data: bytes | None, what: str) -> Any:
-        return _error(404, f"There is no such {what}.") if data is None else Response(data, media_type="image/jpeg")
+        return error(404, f"There is no such {what}.") if data is None else Response(data, media_type="image/jpeg")
 
     @app.get("/api/camera/{name:path}.jpg")
     def _(name: str) -> Any:
@@ -184,7 +139,7 @@ def _add_pictures(app: "FastAPI", board: Board) -> None:
         if frame is not None:
             return jpeg(board.film_jpeg(episode, camera, frame), "picture")
         times = board.film_times(episode, camera)
-        return _error(404, "There is no such film.") if times is None else JSONResponse({"times": times})
+        return error(404, "There is no such film.") if times is None else JSONResponse({"times": times})
 
 
 def _add_socket(
@@ -197,7 +152,7 @@ def _add_socket(
     async def _(socket: WebSocket) -> None:
         try:
             client = _client(socket.query_params, socket.headers)
-        except _NonsenseError:
+        except NonsenseError:
             client = None
         if client is None or len(pages) >= MAX_PAGES:
             await socket.close(1008 if client is None else 1013)
@@ -224,25 +179,6 @@ def _add_socket(
                 pushing.cancel()
 
 
-def _add_files(app: "FastAPI") -> frozenset[str]:
-    """The page itself, read once; returns the paths, which need no token: there are no data in them."""
-    from fastapi import Response
-
-    def add(path: str, content: bytes, kind: str) -> None:
-        async def route() -> Any:
-            return Response(content, media_type=kind)
-
-        app.get(path)(route)
-
-    public = set()
-    for file in sorted((Path(__file__).parent / "static").iterdir()):
-        if file.suffix in KINDS:
-            path = "/" if file.name == "index.html" else f"/{file.name}"
-            add(path, file.read_bytes(), KINDS[file.suffix])
-            public.add(path)
-    return frozenset(public)
-
-
 def _state(board: Board, control: Control, client: str | None) -> dict[str, Any]:
     return board.snapshot() | {"control": control.snapshot(client)}
 
@@ -261,14 +197,14 @@ def _answer(text: str | None, apply: Callable[[Event], Any]) -> dict[str, Any] |
     """Answer to a message of a page; None to a sign of life."""
     number: int | None = None
     try:
-        given = _parsed((text or "").encode(errors="replace"))
+        given = parsed((text or "").encode(errors="replace"))
         if given == {"alive": True}:
             return None
         asked = given.get("id")
         number = asked if isinstance(asked, int) and not isinstance(asked, bool) and abs(asked) < 2**53 else None
-        _check(given, {"event": str, "id": int})
+        check(given, {"event": str, "id": int})
         after = apply(_event(given["event"]))
-    except (_NonsenseError, RefusedError, ViewingOnlyError) as problem:
+    except (NonsenseError, RefusedError, ViewingOnlyError) as problem:
         return {"answer": number, "ok": False, "error": str(problem)}
     return {"answer": number, "ok": True, "state": str(after)}
 
@@ -276,7 +212,7 @@ def _answer(text: str | None, apply: Callable[[Event], Any]) -> dict[str, Any] |
 def _event(name: str) -> Event:
     events = [event for event in Event if event not in BY_ITSELF]
     if name not in events:
-        raise _NonsenseError(f"Unknown event {name[:40]!r}: expected one of {', '.join(events)}.")
+        raise NonsenseError(f"Unknown event {name[:40]!r}: expected one of {', '.join(events)}.")
     return Event(name)
 
 
@@ -284,34 +220,5 @@ def _client(query: Mapping[str, str], headers: Mapping[str, str]) -> str | None:
     """Name of the client, by `client=` or the header X-Client; None where none is given."""
     given = query.get("client", headers.get("x-client"))
     if given is not None and not CLIENT.fullmatch(given):
-        raise _NonsenseError("The client's name is 1 to 64 letters, digits, '-' or '_'.")
+        raise NonsenseError("The client's name is 1 to 64 letters, digits, '-' or '_'.")
     return given
-
-
-async def _body(request: Any, expected: Mapping[str, type]) -> dict[str, Any]:
-    """The body as the JSON object that is expected, {} for none where nothing is. Raises _NonsenseError."""
-    data = b""
-    async for chunk in request.stream():
-        data += chunk
-        if len(data) > MAX_BODY:
-            raise _NonsenseError(f"The body is too long: expected at most {MAX_BODY} bytes.")
-    given = _parsed(data) if data or expected else {}
-    _check(given, expected)
-    return given
-
-
-def _parsed(data: bytes) -> dict[str, Any]:
-    try:
-        given = json.loads(data)
-    except (ValueError, RecursionError) as problem:
-        raise _NonsenseError("Expected a JSON object.") from problem
-    if not isinstance(given, dict):
-        raise _NonsenseError("Expected a JSON object.")
-    return given
-
-
-def _check(given: Mapping[str, Any], expected: Mapping[str, type]) -> None:
-    fits = given.keys() == expected.keys() and all(type(given[name]) is kind for name, kind in expected.items())
-    if not fits:
-        names = ", ".join(f'"{name}" ({kind.__name__})' for name, kind in expected.items()) or "no fields"
-        raise _NonsenseError(f"Expected a JSON object with exactly {names}.")

@@ -1,35 +1,20 @@
 """The operator's page as a server beside the training loop, in a thread of its own."""
 
-import contextlib
-import secrets
-import socket
-import threading
-import time
-from types import TracebackType
-from typing import Any, Self
-from urllib.parse import quote
-
-from lerobot_cqn.errors import ConfigError
+from cqn_data.web.server import PageServer
 
 from ...clock import REAL, Clock
 from ..board import Board
 from ..control import Control
-from .access import ANY_ADDRESS
-from .app import MAX_BODY, make_app, need_extra
+from .app import make_app, need_extra
 
 __all__ = ["OperatorServer", "make_app"]
 
-MIN_TOKEN = 8  # characters
-START_S = 15.0
-CLOSE_S = 1.0  # for requests that are under way
 
-
-class OperatorServer:
+class OperatorServer(PageServer):
     """Serves `board` to operator and viewers while it is entered.
 
-    host: address to listen on; 0.0.0.0 lets other machines reach it. port: 0 takes any free one, which `port` then
-    says. token: what a request must bring; None makes one. absent_s: seconds without a sign of the operator after
-    which a moving arm pauses.
+    host, port, token: as of every page. absent_s: seconds without a sign of the operator after which a moving arm
+    pauses.
 
     Raises ConfigError when made: without the packages of the extra, for a port in use, for a short token.
     """
@@ -44,93 +29,9 @@ class OperatorServer:
         clock: Clock = REAL,
     ) -> None:
         need_extra()
-        if token is not None and len(token) < MIN_TOKEN:
-            raise ConfigError(f"The page's token has {len(token)} characters: expected at least {MIN_TOKEN}.")
-        self.host, self.token = host, token if token is not None else secrets.token_urlsafe(16)
         self.control = Control(board.session, absent_s, said=board.message, clock=clock)
-        app = make_app(board, self.token, self.control, host=host, check_s=min(0.25, absent_s / 4))
-        self._socket = _listen(host, port)
-        self.port: int = self._socket.getsockname()[1]
-        self._server = _quiet_server(app)
-        self._thread = threading.Thread(target=self._run, name="operator-page", daemon=True)
-
-    @property
-    def url(self) -> str:
-        """Address of the page, with its token."""
-        host = _own_address() if self.host in ANY_ADDRESS else self.host
-        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/?token={quote(self.token, safe='')}"
-
-    def __enter__(self) -> Self:
-        """Start; returns when the page can be opened. Raises ConfigError where it does not start."""
-        self._thread.start()
-        deadline = time.monotonic() + START_S
-        while not self._server.started:
-            if not self._thread.is_alive() or time.monotonic() > deadline:
-                self.close()
-                raise ConfigError(f"The operator's page does not start on {self.host}:{self.port}.")
-            time.sleep(0.01)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop, whoever is still looking."""
-        self.close()
-
-    def close(self) -> None:
-        """Stop serving and give the port back; may be called again."""
-        self._server.should_exit = True
-        if self._thread.is_alive():
-            self._thread.join(CLOSE_S + 1)
-            self._server.force_exit = True
-            self._thread.join(CLOSE_S)
-        self._socket.close()
-
-    def _run(self) -> None:
-        try:
-            self._server.run(sockets=[self._socket])
-        except SystemExit:  # uvicorn's way to say that it could not start
-            pass
-        finally:
-            self.control.pause("The operator's page is closed: the arm pauses.")
-
-
-def _quiet_server(app: Any) -> Any:
-    import uvicorn
-
-    config = uvicorn.Config(
-        app, log_config=None, access_log=False, log_level="critical", server_header=False, lifespan="on",
-        ws_max_size=MAX_BODY, ws_max_queue=8, ws_ping_interval=5.0, ws_ping_timeout=10.0, timeout_keep_alive=5,
-        timeout_graceful_shutdown=int(CLOSE_S), proxy_headers=False,
-    )  # fmt: skip
-    return uvicorn.Server(config)
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    """A socket that listens already: two runs on one port are noticed before anything starts."""
-    name = host.strip("[]")
-    if not 0 <= port <= 65535:  # a larger one would be taken for another
-        raise ConfigError(f"The page's port is {port}: expected 1 to 65535, or 0 for any free one.")
-    try:
-        family, kind, proto, _, address = socket.getaddrinfo(name, port, type=socket.SOCK_STREAM)[0]
-    except (OSError, OverflowError, UnicodeError) as error:
-        raise ConfigError(f"The page cannot be served on {host}:{port}: {error}. Give another host.") from error
-    listening = socket.socket(family, kind, proto)
-    try:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listening.bind(address)
-        listening.listen(64)
-    except (OSError, OverflowError) as error:
-        listening.close()
-        raise ConfigError(
-            f"The page cannot be served on {host}:{port}: {error}. Give another port, or 0 for any free one."
-        ) from error
-    return listening
-
-
-def _own_address() -> str:
-    """The address by which other machines reach this one; nothing is sent to find it."""
-    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.connect(("192.0.2.1", 9))
-        return str(probe.getsockname()[0])
-    return "127.0.0.1"
+        super().__init__(
+            lambda token: make_app(board, token, self.control, host=host, check_s=min(0.25, absent_s / 4)),
+            "operator page", host, port, token,
+            ended=lambda: self.control.pause("The operator's page is closed: the arm pauses."),
+        )  # fmt: skip
