@@ -20,12 +20,15 @@ from .common import (
     folder_task,
     in_natural_order,
     join,
+    join_action,
     lacks,
     reading,
     reward_columns,
+    sentence,
     whole_fps,
 )
 from .disk_arrays import Rows, array_of, open_hdf5
+from .leftovers import arrays_in, left_out
 
 __all__ = ["open_reader"]
 
@@ -34,6 +37,9 @@ ARM = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotat
 JOINTS = [f"{side}_{joint}" for side in ("left", "right") for joint in ARM]
 OWN_COLUMN = {"qvel": "observation.velocity", "effort": "observation.effort"}
 BASE = "base_action"
+IMAGES, LANGUAGE = "observations/images/", "language_raw"
+COUNTS = "compress_len"  # how long each JPEG is; its own end tells
+REWARDS = ("reward", "rewards", "success")
 
 
 @contextlib.contextmanager
@@ -57,24 +63,30 @@ class _Aloha:
         self.episodes = in_natural_order(self._files)
         if not files:
             raise DataError(f"{request.input}: expected episode_0.hdf5, episode_1.hdf5, …, found none.")
-        observations, pictures, based = self._look()
+        seen = self._look()
+        first = next(iter(seen.values()))
+        observations = [k.removeprefix("observations/") for k in first if re.fullmatch(r"observations/[^/]+", k)]
+        pictures = [k.removeprefix(IMAGES) for k in first if k.startswith(IMAGES)]
         depth = [key for key in pictures if key.endswith("_depth")]
         self._cameras = camera_columns([key for key in pictures if key not in depth], request)
         self._state = choose("key in --state_keys", request.state_keys, observations) or ["qpos"]
         self._others = {k: v for k, v in OWN_COLUMN.items() if k in observations and k not in self._state}
-        self._based = based
-        unused = [k for k in observations if k not in self._state and k not in self._others]
-        self.notes = [f"Left out of observations: {', '.join(unused)}."] if unused else []
-        if unseen := [key for key in pictures if key not in self._cameras]:
-            self.notes.append(f"Left out of observations/images: {', '.join(unseen)}.")
-        if based:
+        self._actions = choose("array in --action_keys", request.action_keys, first) or [ACTION]
+        self._based = BASE in first and BASE not in self._actions
+        taken = {f"observations/{k}" for k in (*self._state, *self._others)} | {IMAGES + k for k in self._cameras}
+        taken |= {*self._actions, BASE, COUNTS, *(() if request.task else (LANGUAGE,))}
+        self.notes = left_out(seen, taken | (set(REWARDS) if request.rewards else set()))
+        if request.input.is_dir() and (beside := sorted(p.name for p in request.input.iterdir() if p not in files)):
+            self.notes.append(f"Left out of the folder: {', '.join(beside)}.")
+        if self._based:
             self.notes.append(f"The motion of the base stays a column of its own, '{BASE}'; the action is the arms'.")
         self.fps = whole_fps(request, ALOHA_FPS, "ALOHA's control rate")
         self.robot_type: str | None = "aloha"
-        self._task = request.task or folder_task(request.input if request.input.is_dir() else request.input.parent)
+        self._task = folder_task(request.input if request.input.is_dir() else request.input.parent)
 
-    def _look(self) -> tuple[list[str], list[str], bool]:
-        """Numbers and cameras of the first episode that can be read, and whether there is a base."""
+    def _look(self) -> dict[str, list[str]]:
+        """Arrays of the episodes that can be read, by the episode's name."""
+        seen: dict[str, list[str]] = {}
         first: DataError | None = None
         for name in self.episodes:
             path = self._files[name]
@@ -82,12 +94,12 @@ class _Aloha:
                 with open_hdf5(path) as file, reading(str(path)):
                     if "observations" not in file:
                         raise lacks(str(path), "observations", file.keys())
-                    group = file["observations"]
-                    numbers = [k for k, v in group.items() if hasattr(v, "shape") and len(v.shape) == 2]
-                    return numbers, list(group.get("images", ())), BASE in file
+                    seen[name] = arrays_in(file)
             except DataError as error:
                 first = first or error
-        raise first or DataError(f"{self._request.input} holds no episode.")
+        if not seen:
+            raise first or DataError(f"{self._request.input} holds no episode.")
+        return seen
 
     @contextlib.contextmanager
     def episode(self, name: str) -> Iterator[Episode]:
@@ -99,19 +111,22 @@ class _Aloha:
                 names: dict[str, list[str]] = {}
                 keys = {k: array_of(file, f"observations/{k}", where)[()] for k in self._state}
                 columns[STATE], names[STATE] = join(keys)
-                columns[ACTION], names[ACTION] = join({"action": array_of(file, "action", where)[()]})
+                commands = {key: array_of(file, key, where)[()] for key in self._actions}
+                columns[ACTION], names[ACTION] = join_action(commands)
                 for key, target in self._others.items():
                     values = array_of(file, f"observations/{key}", where)[()]
                     columns[target], names[target] = join({key: values})
                 if self._based:
                     columns[BASE], names[BASE] = join({BASE: array_of(file, BASE, where)[()]})
-                there = {key: file[key][()] for key in ("reward", "rewards", "success") if key in file}
+                there = {key: file[key][()] for key in REWARDS if key in file}
                 columns |= reward_columns({k: v for k, v in there.items() if v.ndim}, self._request)[0]
                 images = {to: array_of(file, f"observations/images/{key}", where) for key, to in self._cameras.items()}
+                said = sentence(file[LANGUAGE][()]) if LANGUAGE in file else None
             arm_keys = (ACTION, *OWN_COLUMN.values(), *([STATE] if self._state == ["qpos"] else []))
             names |= {k: JOINTS for k in arm_keys if k in names and len(names[k]) == len(JOINTS)}
             cameras = {target: Pictures(Rows(array)) for target, array in images.items()}
-            yield Episode(where=where, task=self._task, columns=columns, names=names, cameras=dict(cameras))
+            task = self._request.task or said or self._task
+            yield Episode(where=where, task=task, columns=columns, names=names, cameras=dict(cameras))
 
 
 def _is_episode(path: Path) -> bool:

@@ -30,11 +30,13 @@ __all__ = [
     "folder_task",
     "in_natural_order",
     "join",
+    "join_action",
     "lacks",
     "need",
     "number_column",
     "reading",
     "reward_columns",
+    "sentence",
     "storable",
     "whole_fps",
 ]
@@ -57,6 +59,7 @@ class Request:
         task: sentence for every episode, instead of what the input says.
         image_keys: cameras by their name in the input; ``("none",)`` takes none.
         state_keys: what makes up ``observation.state``, in this order, by name in the input.
+        action_keys: what makes up ``action``, likewise.
         rewards: whether reward columns are taken over.
     """
 
@@ -65,6 +68,7 @@ class Request:
     task: str | None = None
     image_keys: tuple[str, ...] = ()
     state_keys: tuple[str, ...] = ()
+    action_keys: tuple[str, ...] = ()
     rewards: bool = True
 
 
@@ -271,6 +275,19 @@ def join(parts: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.float32], list[s
     flat = {key: np.asarray(v, np.float32).reshape(len(v), -1) for key, v in parts.items()}
     names = [name for key, values in flat.items() for name in dimension_names(key, values)]
     return np.concatenate(list(flat.values()), axis=1), names
+
+
+def join_action(parts: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.float32], list[str]]:
+    """As :func:`join`; the dimensions of a single array are ``action.0``, ``action.1``, …, whatever it is called."""
+    return join(parts if len(parts) > 1 else {ACTION: next(iter(parts.values()))})
+
+
+def sentence(value: Any) -> str | None:
+    """A task from text, bytes or the first of several; None for anything else, and where there are no words."""
+    while isinstance(value, list | tuple | np.ndarray) and len(np.atleast_1d(np.asarray(value, object))):
+        value = np.atleast_1d(np.asarray(value, object))[0]
+    text = value.decode(errors="replace") if isinstance(value, bytes) else value
+    return " ".join(text.replace('"', " ").split()) or None if isinstance(text, str) else None
 
 
 def storable(array: Any) -> bool:

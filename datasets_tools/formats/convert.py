@@ -38,6 +38,7 @@ cqn-data convert --from=rlbench --input=rlbench_data/open_drawer \\
 cqn-data convert --from=robomimic --input=lift/image.hdf5 --new_repo_id=local/lift --new_root=data/lift
 """
 SMALLEST_VIDEO = 32  # pixels; LeRobot's default encoder ends the whole process on pictures much smaller
+CHOICE_OF_ACTIONS = ("robomimic", "aloha", "diffusion_policy")
 SHARED = ("from_", "input", "new_repo_id", "new_root", "dry_run")  # options that every format knows
 
 
@@ -61,6 +62,12 @@ class ConvertConfig:
         default_factory=list,
         metadata={"help": "What observation.state is put together from, in this order, e.g. '[qpos, qvel]'."},
     )
+    action_keys: list[str] = dataclasses.field(
+        default_factory=list,
+        metadata={
+            "help": "What action is put together from, e.g. '[actions_abs]'; of robomimic, aloha, diffusion_policy."
+        },
+    )
     rewards: bool = option(True, help="Keep rewards, ends and successes where the input has them.")
     video: bool = option(True, help="Store pictures as video; false stores every picture without loss.")
     swap_colors: bool = option(False, help="Exchange red and blue, e.g. where OpenCV wrote JPEGs from RGB arrays.")
@@ -75,6 +82,11 @@ class ConvertConfig:
             raise ConfigError(f"Expected --fps >= 1, got {self.fps}.")
         if self.task is not None and not self.task.strip():
             raise ConfigError("Expected a sentence in --task, got an empty one.")
+        if self.action_keys and self.from_ not in CHOICE_OF_ACTIONS:
+            raise ConfigError(
+                f"--action_keys chooses among the arrays of {', '.join(CHOICE_OF_ACTIONS)}; --from={self.from_} has one"
+                " action: leave it out."
+            )
         if self.from_ == LEROBOT_V21:
             changed = [f.name for f in dataclasses.fields(self) if f.name not in SHARED and not _is_default(self, f)]
             if changed:
@@ -155,6 +167,7 @@ def _open_reader(config: ConvertConfig, source: Path) -> "AbstractContextManager
         task=config.task,
         image_keys=tuple(config.image_keys),
         state_keys=tuple(config.state_keys),
+        action_keys=tuple(config.action_keys),
         rewards=config.rewards,
     )
     module = importlib.import_module(f".{config.from_}", __package__)

@@ -20,12 +20,15 @@ from .common import (
     folder_task,
     in_natural_order,
     join,
+    join_action,
     lacks,
     reading,
     reward_columns,
+    sentence,
     whole_fps,
 )
 from .disk_arrays import Rows, array_of, open_hdf5
+from .leftovers import arrays_in, left_out
 
 __all__ = ["open_reader"]
 
@@ -66,18 +69,26 @@ class _Robomimic:
             )
         pictures = [key for key, ndim in shapes.items() if ndim == 4 and key.endswith("_image")]
         others = [key for key, ndim in shapes.items() if ndim == 4 and key not in pictures]
+        with reading(path):
+            seen = {name: arrays_in(self._data[name]) for name in self.episodes}
+            first = seen[self.episodes[0]]
+        self._actions = choose("array in --action_keys", request.action_keys, first) or ["actions"]
         numbers = [key for key, ndim in shapes.items() if ndim < 4]
         self._cameras = camera_columns(pictures, request, others)
         self._state = choose("key in --state_keys", request.state_keys, numbers) or _default_state(path, numbers)
         self._object = OBJECT in numbers and OBJECT not in self._state
-        used = {*self._cameras, *self._state, *([OBJECT] if self._object else [])}
-        left_out = sorted(shapes.keys() - used)
-        self.notes = [f"Left out of obs: {', '.join(left_out)}."] if left_out else []
+        used = {f"obs/{key}" for key in (*self._cameras, *self._state, *([OBJECT] if self._object else []))}
+        rewards = {"rewards", "dones", "success"} if request.rewards else set()
+        self.notes = left_out(seen, {*used, *self._actions, *rewards})
+        if beside := sorted(key for key in file if key != "data"):
+            self.notes.append(f"Left out of the file: {', '.join(beside)}.")
         arguments = _env_args(path, self._data)
         self.fps = whole_fps(request, *_frame_rate(arguments))
         robots = arguments.get("env_kwargs", {}).get("robots")
         self.robot_type = "_".join(robots) if isinstance(robots, list) else robots
-        self._task = request.task or str(arguments.get("env_name") or folder_task(request.input)).replace("_", " ")
+        self._task = str(_problem(path, self._data) or arguments.get("env_name") or folder_task(request.input)).replace(
+            "_", " "
+        )
 
     @contextlib.contextmanager
     def episode(self, name: str) -> Iterator[Episode]:
@@ -92,11 +103,12 @@ class _Robomimic:
             if self._object:
                 values, labels = join({OBJECT: array_of(demo, f"obs/{OBJECT}", where)[()]})
                 columns[ENVIRONMENT_STATE], names[ENVIRONMENT_STATE] = values, labels
-            columns[ACTION], names[ACTION] = join({"action": array_of(demo, "actions", where)[()]})
+            columns[ACTION], names[ACTION] = join_action({k: array_of(demo, k, where)[()] for k in self._actions})
             there = {key: demo[key][()] for key in ("rewards", "dones", "success") if key in demo}
             columns |= reward_columns(there, self._request)[0]
             cameras = {to: Pictures(Rows(array_of(demo, f"obs/{key}", where))) for key, to in self._cameras.items()}
-        yield Episode(where=where, task=self._task, columns=columns, names=names, cameras=dict(cameras))
+            task = self._request.task or _told(demo) or self._task
+        yield Episode(where=where, task=task, columns=columns, names=names, cameras=dict(cameras))
 
 
 def _default_state(path: str, numbers: list[str]) -> list[str]:
@@ -108,6 +120,24 @@ def _default_state(path: str, numbers: list[str]) -> list[str]:
             f"{path}: no robot0_eef_pos and the like in obs; choose --state_keys from {', '.join(numbers)}."
         )
     return chosen
+
+
+def _told(demo: Any) -> str | None:
+    """The task as a demonstration itself tells it, in ``ep_meta`` or its own attribute."""
+    meta = sentence(demo.attrs.get("ep_meta"))
+    if meta is not None:
+        found = json.loads(demo.attrs["ep_meta"])
+        return sentence(found.get("lang")) or sentence(found.get("language_instruction"))
+    return sentence(demo.attrs.get("language_instruction")) or sentence(demo.attrs.get("lang"))
+
+
+def _problem(path: str, data: Any) -> str | None:
+    """The task as ``problem_info`` tells it for the whole file."""
+    text = data.attrs.get("problem_info")
+    if text is None:
+        return None
+    with reading(f"{path}, attribute problem_info"):
+        return sentence(json.loads(text).get("language_instruction"))
 
 
 def _env_args(path: str, data: Any) -> dict[str, Any]:

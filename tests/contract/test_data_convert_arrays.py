@@ -41,7 +41,8 @@ def test_robomimic_state_objects_rewards_and_video(tmp_path, target, capsys):
     assert convert("robomimic", source, target) == 0
     out, err = capsys.readouterr()
     assert "20 frames a second (env_args.env_kwargs.control_freq)" in out
-    assert "Left out of obs: robot0_joint_pos" in err
+    assert "Left out: next_obs (6 arrays), obs/robot0_joint_pos, states." in err
+    assert "Left out of the file: mask." in err
     assert snapshot(source) == before
     dataset = LeRobotDataset("local/dst", target)
     assert dataset.meta.robot_type == "Panda"
@@ -132,7 +133,7 @@ def test_aloha_jpeg_pictures_and_swapped_colours(tmp_path, target, compress, cap
     dataset = LeRobotDataset("local/dst", target)
     shown = frame(dataset, 1, "cam_high").astype(float)
     assert dataset.fps == 25
-    assert ("Left out of observations/images: cam_high_depth." in capsys.readouterr().err) == (compress == "bytes")
+    assert ("Left out: observations/images/cam_high_depth." in capsys.readouterr().err) == (compress == "bytes")
     assert np.abs(shown - expected[0]["cam_high"][1][:, :, ::-1]).mean() < 4
 
 
