@@ -20,6 +20,7 @@ from ..views.episode import Bounds, Camera, Episode
 from ..views.view import View
 from .columns import places, read_column, refuse_disorder, refuse_uneven, tasks_by_index
 from .decoded import Colours, Decoded
+from .fetch import fetched
 from .folders import local_root
 from .pictures import picture_size, shaped, video_pictures
 from .target import read_history
@@ -282,13 +283,24 @@ class Source(View):
             self._cached_bytes += size
 
 
-def open_source(repo_id: str, root: str | None) -> Source:
-    """Open a dataset that lies on this disk.
+def open_source(repo_id: str, root: str | None, revision: str | None = None) -> Source:
+    """Open a dataset on this disk; one that is not here, and has the name of one on the Hub, is downloaded.
+
+    Args:
+        repo_id: ``user/name``.
+        root: its folder, which is never downloaded to; by default LeRobot's home and the name, then LeRobot's cache.
+        revision: branch, tag or commit on the Hub; what lies in LeRobot's home is left aside for it.
 
     Raises:
         DataError: nothing there, another format version, empty, or damaged.
     """
     folder = local_root(repo_id, root)
+    if root is None and (revision is not None or not (folder / "meta/info.json").is_file()):
+        folder = fetched(repo_id, revision)
+    elif revision is not None:
+        raise DataError(
+            f"--revision={revision} names a state on the Hub, --root={root} a folder here: give one of them."
+        )
     info_path = folder / "meta" / "info.json"
     if not info_path.is_file():
         raise DataError(

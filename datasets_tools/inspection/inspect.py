@@ -15,7 +15,7 @@ from lerobot_cqn.schema import STATE
 
 from ..disk.folders import refuse_existing
 from ..terminal.console import load_lerobot, note, progress, result, table
-from ..terminal.options import help_page, option, parse
+from ..terminal.options import REVISION, ROOT, help_page, option, parse
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -47,7 +47,8 @@ class InspectConfig:
     """Settings of ``cqn-data inspect``."""
 
     repo_id: str = option(help="Dataset to look at, as user/name.")
-    root: str | None = option(None, help="Its folder; by default LeRobot's home and the repo_id.")
+    root: str | None = option(None, help=ROOT)
+    revision: str | None = option(None, help=REVISION)
     html: str | None = option(
         None, help=f"Write the page to this file, which must not exist; by default {PAGE}, with --json none."
     )
@@ -101,7 +102,7 @@ def main(args: list[str]) -> int:
     if page is not None:
         refuse_existing(page)
     try:
-        source = open_source(config.repo_id, config.root)
+        source = open_source(config.repo_id, config.root, config.revision)
     except DataError as error:
         found = Inspection([Finding("error", "unreadable", "dataset", str(error))])
         if config.json:

@@ -59,6 +59,10 @@ of the next step minus this one (the way back gives where the arm went, not what
                 "--to=absolute takes its kind from the dataset's history; leave out --of and --keep_absolute."
             )
 
+    def suffix(self) -> str:
+        """What was made: deltas, or absolute actions."""
+        return self.to
+
     def on(self, view: "View") -> "DerivedView":
         """Decide which dimensions are joints; raises ConfigError or DataError where that cannot be done."""
         from ..views.delta import AbsoluteView, DeltaView

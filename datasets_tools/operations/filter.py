@@ -110,8 +110,8 @@ Delta actions are formed anew, so that they connect the states that are left.
         if self.preview:
             from .preview import write_preview
 
-            write_preview(self.preview, view, after, rule)
-            result(f"Preview: {self.preview}")
+            shown = write_preview(self.preview, view, after, rule)
+            result(f"Preview: {self.preview}{shown}")
         steps, kept = sum(r.steps for r in reports), sum(r.kept for r in reports)
         settings = settings_of(self) | {"threshold": min(rule.thresholds, default=0.0)} | why
         settings.pop("preview", None)

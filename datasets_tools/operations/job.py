@@ -14,7 +14,8 @@ from lerobot_cqn.errors import ConfigError, one_of
 
 from ..disk.folders import local_root, refuse_existing, refuse_inside
 from ..terminal.console import load_lerobot, note, progress, result
-from ..terminal.options import help_page, option, parse_all
+from ..terminal.options import REVISION, ROOT, help_page, option, parse_all
+from .sharing import Sharing
 
 if TYPE_CHECKING:
     from ..views.view import DerivedView, View
@@ -23,11 +24,12 @@ __all__ = ["Job", "Step", "help_for", "main_for", "run_job", "settings_of"]
 
 
 @dataclasses.dataclass
-class Job:
+class Job(Sharing):
     """Places to read and write; the same for every operation, named as in ``lerobot-edit-dataset``."""
 
     repo_id: str = option(help="Dataset to read, as user/name.")
-    root: str | None = option(None, help="Its folder; by default LeRobot's home and the repo_id.")
+    root: str | None = option(None, help=ROOT)
+    revision: str | None = option(None, help=REVISION)
     new_repo_id: str | None = option(None, help="Name of the new dataset; by default the old one and the operation.")
     new_root: str | None = option(
         None, help="Its folder, which must not exist; by default LeRobot's home and the name."
@@ -64,6 +66,10 @@ class Step:
 
     def validate(self) -> None:
         """Check ranges; raises ConfigError naming the option, what was expected and what was found."""
+
+    def suffix(self) -> str:
+        """What the result is called after the source's name, where no name is given."""
+        return self.name
 
     def reads_numbers(self) -> bool:
         """Whether states, actions and rewards decide what is done: then all of them must be finite before."""
@@ -127,14 +133,15 @@ def run_job(job: Job, steps: Sequence[Step], name: str | None = None) -> list[di
     from ..disk.readable import readable
     from ..disk.source import open_source
 
-    new_repo_id = job.new_repo_id or f"{job.repo_id}_{name or steps[0].name}"
+    new_repo_id = job.new_repo_id or f"{job.repo_id}_{name or steps[0].suffix()}"
+    job.check(new_repo_id)
     new_root = local_root(new_repo_id, job.new_root)
     if not job.dry_run:
         refuse_existing(new_root)
         refuse_inside(local_root(job.repo_id, job.root), new_root)
     if job.report:
         refuse_existing(Path(job.report))
-    source = open_source(job.repo_id, job.root)
+    source = open_source(job.repo_id, job.root, job.revision)
     before = len(source.history())
     view = readable(source, job.actions, skip_bad_episodes=job.skip_bad_episodes, needs_videos=not job.dry_run)
     for step in steps:
@@ -165,6 +172,7 @@ def run_job(job: Job, steps: Sequence[Step], name: str | None = None) -> list[di
         f"Wrote {new_repo_id} to {new_root}: {written.episodes} episodes, {written.frames} steps"
         + (how and f"; {how}.")
     )
+    job.share(new_repo_id, new_root)
     return view.history()[before:]
 
 

@@ -23,8 +23,8 @@ EPISODES = 6  # curves at most
 RED = np.array([214, 40, 40], np.float64)
 
 
-def write_preview(path: str, before: View, after: View, rule: Rule) -> None:
-    """Write ``path``, a .mp4 or a .png file, in one piece.
+def write_preview(path: str, before: View, after: View, rule: Rule) -> str:
+    """Write ``path``, a .mp4 or a .png file, in one piece; returns what it does not show, in brackets, or "".
 
     Args:
         path: file that does not exist.
@@ -44,6 +44,10 @@ def write_preview(path: str, before: View, after: View, rule: Rule) -> None:
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
+    if path.endswith(".png"):
+        return f" (the first {EPISODES} of {len(before.episodes)} episodes)" * (len(before.episodes) > EPISODES)
+    seconds = sum(len(before.episode(i)) for i in before.episodes) / before.fps
+    return f" (the first {SECONDS} of {seconds:.0f} s)" * (seconds > SECONDS)
 
 
 def _kept(before: Episode, after: View) -> NDArray[np.bool_]:

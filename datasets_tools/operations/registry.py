@@ -50,6 +50,7 @@ OPERATIONS = {
     "task": Operation("say in words what the episodes show", "operations.task", "Task"),
     "bounds": Operation("set the action bounds that training scales by", "operations.bounds", "SetBounds"),
     "drop": Operation("leave out whole episodes, by number or by rule", "operations.drop", "Drop"),
+    "merge": Operation("put several recordings of one arm together, after a look whether they fit", "operations.merge"),
     "run": Operation("run several of these as one pass over the videos, from a recipe", "operations.recipe"),
     "push": Operation("upload a dataset to the Hugging Face Hub, with a card that tells how it came about", "hub.push"),
 }

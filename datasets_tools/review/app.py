@@ -31,14 +31,17 @@ FIELDS: dict[str, tuple[type, ...]] = {
 class Review:
     """A recording on a desk: what is shown, what was decided, and the command that carries it out."""
 
-    def __init__(self, recording: Recording, desk: Desk, repo_id: str, root: str | None) -> None:
+    def __init__(
+        self, recording: Recording, desk: Desk, repo_id: str, root: str | None, revision: str | None = None
+    ) -> None:
         self.recording, self.desk, self.errand = recording, desk, Errand()
-        self.repo_id, self.root = repo_id, root
+        self.repo_id, self.root, self.revision = repo_id, root, revision
         self.lock = threading.Lock()
 
     def arguments(self, new_repo_id: str, new_root: str) -> list[str]:
         """The recipe's command without `cqn-data`; empty names take the command's own."""
-        given = {"repo_id": self.repo_id, "root": self.root, "new_repo_id": new_repo_id, "new_root": new_root}
+        given = {"repo_id": self.repo_id, "root": self.root, "revision": self.revision}
+        given |= {"new_repo_id": new_repo_id, "new_root": new_root}
         return ["run", str(self.desk.recipe), *(f"--{name}={value}" for name, value in given.items() if value)]
 
     def state(self) -> dict[str, Any]:
@@ -65,7 +68,7 @@ class Review:
             raise ConfigError("Nothing is decided yet: there is nothing to run.")
         target = local_root(new_repo_id or f"{self.repo_id}_{self.desk.recipe.stem}", new_root or None)
         refuse_existing(target)
-        refuse_inside(local_root(self.repo_id, self.root), target)
+        refuse_inside(self.recording.source.root, target)
         self.errand.start(self.arguments(new_repo_id, new_root))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from lerobot_cqn.errors import ConfigError
 
 from ..terminal.console import load_lerobot, note, result
-from ..terminal.options import help_page, option, parse
+from ..terminal.options import REVISION, ROOT, help_page, option, parse
 
 __all__ = ["ReviewConfig", "help", "main"]
 
@@ -29,7 +29,8 @@ class ReviewConfig:
     """Settings of ``cqn-data review``."""
 
     repo_id: str = option(help="Dataset to look at, as user/name.")
-    root: str | None = option(None, help="Its folder; by default LeRobot's home and the repo_id.")
+    root: str | None = option(None, help=ROOT)
+    revision: str | None = option(None, help=REVISION)
     recipe: str | None = option(None, help="File for what you decide; by default the dataset's name and .yaml.")
     host: str = option("127.0.0.1", help="Address to listen on; 0.0.0.0 lets other machines reach the page.")
     port: int = option(0, help="Port of the page; 0 takes any free one.")
@@ -72,11 +73,11 @@ def main(args: list[str]) -> None:
     from .decided import Desk
     from .recording import Recording
 
-    recording = Recording(open_source(config.repo_id, config.root))
+    recording = Recording(open_source(config.repo_id, config.root, config.revision))
     found = recording.suggestion
     start = float(f"{found.threshold:.4g}") if found is not None and found.clear else None
     desk = Desk(config.file, config.repo_id, recording.lengths, recording.recorded, start)
-    review = Review(recording, desk, config.repo_id, config.root)
+    review = Review(recording, desk, config.repo_id, config.root, config.revision)
     server = PageServer(
         lambda token: make_app(review, token, config.host), "review page", config.host, config.port, config.token
     )

@@ -9,7 +9,11 @@ from lerobot_cqn.errors import ConfigError, one_of
 
 from .mistakes import one_line
 
-__all__ = ["help_page", "option", "parse", "parse_all", "parse_choice", "with_plugins"]
+__all__ = ["REVISION", "ROOT", "help_page", "option", "parse", "parse_all", "parse_choice", "with_plugins"]
+
+
+ROOT = "Its folder; by default LeRobot's home and the repo_id, and where it is not there, the Hub."
+REVISION = "Branch, tag or commit on the Hub; by default the newest of this format."
 
 
 def option(default: Any = dataclasses.MISSING, *, help: str) -> Any:

@@ -38,7 +38,7 @@ FLOORS: dict[str, str] = {
         "base_config model_card|processors base_policy configuration_cqn|configuration_drqv2 "
         "processor_cqn|processor_drqv2 modeling_cqn|modeling_drqv2"
     ),
-    "datasets_tools": "terminal decisions|web views disk operations formats|inspection|hub|review record|cli",
+    "datasets_tools": "terminal decisions|web views disk hub operations formats|inspection|review record|cli",
     "train": (
         "interfaces|clock envs|robot|operator sim_arm|config agent replay run loop arm "
         "push|arguments build cli|bench|demo"

@@ -3,6 +3,7 @@
 import os
 import re
 import shlex
+import shutil
 import textwrap
 
 import numpy as np
@@ -59,6 +60,7 @@ def desk(tmp_path_factory):
     folder = tmp_path_factory.mktemp("desk")
     record(folder / "data/click", 10, (48, 64, 3), 8, 24)
     record(folder / "data/pick", 30, (480, 640, 3), 12, 16)
+    shutil.copytree(folder / "data/pick", folder / "data/pick_more")
     (folder / "my_recipe.yaml").write_text(RECIPE)
     foreign_formats.write_rlbench(folder / "rlbench_data/open_drawer")
     (folder / "lift").mkdir()
