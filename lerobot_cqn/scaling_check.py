@@ -72,12 +72,21 @@ def cut_share(rows: Iterator[Array], low: Array, high: Array) -> Array:
 
 
 def rows_of(root: Path, key: str) -> Iterator[Array]:
-    """The (K, D) values of a column, one data file after the other; none where no file is on this disk."""
+    """The (K, D) values of a column, one data file after the other; none where no file is on this disk.
+
+    Raises DataError for a file that cannot be read, or without the column.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     for path in sorted((Path(root) / "data").rglob("*.parquet")):
-        column = pq.read_table(path, columns=[key])[key]
+        try:
+            column = pq.read_table(path, columns=[key])[key]
+        except (pa.ArrowException, OSError, KeyError) as error:
+            raise DataError(
+                f"{path} cannot be read ({' '.join(str(error).split())[-120:]}): it may be cut short; copy or download"
+                " it again."
+            ) from error
         flat = column.combine_chunks()
         while pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
             flat = flat.flatten()

@@ -96,7 +96,7 @@ def main(args: list[str]) -> None:
 
 def _check_together(sources: "Sequence[Source]") -> None:
     """Raise DataError for the first thing in which a dataset is not like the first one."""
-    from ..disk.timing import TOLERANCE
+    from ..disk.whole import refuse_damaged
 
     first = sources[0]
     if len({s.root.resolve() for s in sources}) < len(sources):
@@ -107,13 +107,7 @@ def _check_together(sources: "Sequence[Source]") -> None:
                 raise DataError(f"{source.root}: expected {what} {own}, as of {first.root}, found {other}.")
         _check_units(first, source)
     for source in sources:
-        source.check_videos()
-        apart = max((source.drift(i, source.recorded_times(i)) for i in source.episodes), default=0.0)
-        if not source.in_order or apart > TOLERANCE:
-            raise DataError(
-                f"{source.root}: its rows are not where LeRobot looks for them, or up to {1000 * apart:.3g} ms off"
-                " their pictures; write it anew first, e.g. with cqn-data trim."
-            )
+        refuse_damaged(source)
 
 
 def _facts(first: "Source", other: "Source") -> list[tuple[str, Any, Any]]:

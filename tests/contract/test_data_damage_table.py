@@ -4,8 +4,15 @@ import shutil
 
 import numpy as np
 import pytest
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from PIL import Image
 
+from cqn_train.config import DatasetSettings
+from cqn_train.replay.demonstrations import Demonstrations
+from lerobot_cqn.errors import CQNError
+from lerobot_cqn.scaling_check import check_scaling
+
+from ..unit.test_policy_batch import make_agent
 from .columns import ACTION, STATE, TOP, edit_info, edit_rows, grey, moving, write_columns
 from .data_recording import last_line, run
 from .test_data_inspect import inspect
@@ -112,6 +119,30 @@ def test_damage_is_known_beforehand_and_mended_or_refused(recording, tmp_path, c
             assert said.startswith("cqn-data "), said
             assert any(word in said for word in ("pisode", str(root))), said
             assert not target.exists()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cqn_train_reads_it_rightly_or_says_what_is_wrong_in_a_line(recording, tmp_path, kind):
+    root = tmp_path / "src"
+    shutil.copytree(recording, root)
+    KINDS[kind](root)
+    settings = DatasetSettings("local/src", str(root))
+    try:
+        data = Demonstrations(settings)
+        check_scaling(data.meta.stats or {}, data.meta, margin=0.0, state_bound=None)
+        read = data.episodes(make_agent(LeRobotDatasetMetadata("local/src", recording)))
+    except CQNError as error:
+        said = str(error)
+        assert "\n" not in said
+        assert any(word in said for word in ("pisode", str(root), f"'{TOP}' has shape")), said
+    else:
+        expected = Demonstrations(DatasetSettings("local/src", str(recording))).episodes(
+            make_agent(LeRobotDatasetMetadata("local/src", recording))
+        )
+        for one, other in zip(read, expected, strict=True):
+            np.testing.assert_allclose(one.action, other.action, atol=1e-5)
+            np.testing.assert_allclose(one.low_dim, other.low_dim, atol=1e-5)
+            np.testing.assert_array_equal(one.pixels[0], other.pixels[0])
 
 
 def test_pictures_of_more_than_8_bits_are_named(tmp_path, capsys):

@@ -15,6 +15,8 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from numpy.typing import NDArray
 
 from cqn_data.decisions.rewards import REWARD_FEATURES, demonstration_end
+from cqn_data.disk.source import open_source
+from cqn_data.disk.whole import refuse_damaged
 from lerobot_cqn.errors import DataError
 from lerobot_cqn.schema import NEXT_REWARD, NEXT_SUCCESS
 
@@ -75,8 +77,17 @@ class Demonstrations:
 
     @cached_property
     def dataset(self) -> LeRobotDataset:
-        """The dataset, with the chosen episodes only."""
-        return LeRobotDataset(self.settings.repo_id, root=self.settings.root, episodes=self.settings.episodes)
+        """The dataset, with the chosen episodes only. Raises DataError for what LeRobot's loader would stumble over."""
+        here = (self.meta.root / "data").is_dir()  # else it is downloaded first
+        if here:
+            self._refuse_damaged(self.meta.root)
+        found = LeRobotDataset(self.settings.repo_id, root=self.settings.root, episodes=self.settings.episodes)
+        if not here:
+            self._refuse_damaged(found.root)
+        return found
+
+    def _refuse_damaged(self, root: Path) -> None:
+        refuse_damaged(open_source(self.settings.repo_id, str(root)), self.settings.episodes)
 
     def first_states(self) -> NDArray[Any] | None:
         """The state at the start of each episode, [K, P]; None where none was recorded."""
@@ -92,7 +103,7 @@ class Demonstrations:
         Without a reward column the last step of each episode counts as the success (reward 1), and a line says so; one
         says so, too, where most steps come after the ends.
         Datasets do not store what came after the last action: the last observation stands in for it.
-        Raises DataError for a missing feature, another size, or values that are not finite.
+        Raises DataError for a missing feature, another size, values that are not finite, or a damaged dataset.
         """
         dataset, policy = self.dataset, agent.policy
         missing = [key for key in (*policy.view_keys, *policy.low_dim_keys, ACTION) if key not in dataset.features]
@@ -179,6 +190,13 @@ def _decode(dataset: LeRobotDataset, agent: Agent, rows: NDArray[Any]) -> tuple[
     """Frames of each view, uint8 [T, 3, H, W]."""
     if not agent.policy.view_keys:
         return ()
-    items = [dataset[int(row)] for row in rows]
+    try:
+        items = [dataset[int(row)] for row in rows]
+    except Exception as error:  # each decoder raises kinds of its own
+        episode, text = int(dataset.hf_dataset[int(rows[0])]["episode_index"]), " ".join(str(error).split())[:160]
+        raise DataError(
+            f"Pictures of episode {episode} cannot be read ({text}): look with `cqn-data inspect`, and leave the "
+            "episode out with --dataset.episodes or `cqn-data drop`."
+        ) from error
     frame = {key: torch.stack([item[key] for item in items]) for key in agent.policy.view_keys}
     return tuple(agent.pixels(frame))
