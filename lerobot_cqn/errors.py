@@ -10,8 +10,11 @@ class CQNError(Exception):
     """Base of all errors a user can cause; commands print it as one line and exit with code 2."""
 
 
-class ConfigError(CQNError, ValueError):
-    """A setting is out of range, unknown, or does not fit the features."""
+class ConfigError(CQNError):
+    """A setting is out of range, unknown, or does not fit the features.
+
+    No ValueError: the parser of LeRobot's commands hides those behind "Couldn't instantiate class".
+    """
 
 
 class DataError(CQNError, ValueError):

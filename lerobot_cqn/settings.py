@@ -76,7 +76,7 @@ class CQNSettings(CommonSettings):
     """Hyperparameters of CQN. Raises ConfigError when a value is out of its range."""
 
     # Discretisation
-    levels: int = number(3, least=1)  # L, levels of zooming in
+    levels: int = number(3, least=1, most=16)  # L, levels of zooming in
     bins: int = number(5, least=2)  # N, bins of each level
     # Losses; rl_loss_scale=0 gives the paper's CBC baseline, distributional=False also margin-only imitation
     bc_dominance: bool = True  # False: margin only

@@ -1,5 +1,6 @@
 """The command line of `cqn-train`: from arguments to settings, and from a mistake to one line about it."""
 
+import json
 import logging
 from collections.abc import Sequence
 from dataclasses import fields
@@ -7,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+import yaml
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError
 from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
@@ -67,6 +69,8 @@ PRESETS: dict[str, dict[str, str]] = {
         "laptop_pixels": "ours: DrQ-v2+ at the sizes of CQN's laptop_pixels",
     },
 }
+CHANGED_ON_RESUME = ("device", "push_to_hub", "repo_id", "private", "license", "tags")  # of the policy
+KEPT_ON_RESUME = ("dataset.episodes", "action_bounds")
 LAST = (
     "Add --env.type=..., --robot.type=... or --policy.type=cqn before --help to see their options; --debug shows "
     "tracebacks.\n"
@@ -94,6 +98,7 @@ def parse(arguments: Sequence[str]) -> RunConfig:
         if output_dir is None:
             raise ConfigError("--resume needs the run's folder: give --output_dir=DIR.")
         config_file = str(last_checkpoint(Path(output_dir), logger.warning) / "pretrained_model" / "train_config.json")
+        _refuse_without_effect(arguments, config_file)
     config_file = parser.parse_arg("config_path", arguments) or config_file
     arguments = parser.filter_arg("config_path", arguments)
     path = parser.parse_arg("policy.path", arguments)
@@ -114,6 +119,26 @@ def parse(arguments: Sequence[str]) -> RunConfig:
     if wanted and config.policy and config.policy.device != wanted:
         logger.warning("The device '%s' is not available: using '%s'.", wanted, config.policy.device)
     return config
+
+
+def _refuse_without_effect(arguments: Sequence[str], config_file: str) -> None:
+    """Refuse options that a resumed run would take no notice of. Raises ConfigError naming the first one.
+
+    What a run has learned from stays as it was: its policy, its demonstrations, what -1..1 is.
+    """
+    recorded = json.loads(Path(config_file).read_text(encoding="utf-8"))
+    for argument in arguments:
+        name, _, given = argument.removeprefix("--").partition("=")
+        kept = name.startswith("policy.") and name.removeprefix("policy.") not in CHANGED_ON_RESUME
+        if not (kept or name in KEPT_ON_RESUME):
+            continue
+        group, _, field = name.rpartition(".")
+        value = (recorded.get(group) or {}).get(field) if group else recorded.get(field)
+        if yaml.safe_load(given) != value and given != str(value):
+            raise ConfigError(
+                f"--{name}={given} has no effect on --resume: the run goes on with {value}. Leave it out, or begin a "
+                "new run from this policy with --policy.path=…/pretrained_model."
+            )
 
 
 def _pretrained_config(path: str, overrides: list[str]) -> PreTrainedConfig:

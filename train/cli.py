@@ -18,6 +18,7 @@ from .arguments import introduction, parse
 from .arm.devices import register_devices
 from .config import RunConfig, ValidRun
 from .interfaces import Interrupted
+from .run.blame import plugin_at_fault
 from .run.progress import ConsoleMonitor
 from .run.stop import StopRequest
 
@@ -41,8 +42,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as error:  # of a push it says what is on the Hub
         print(f"cqn-train: {error or 'stopped at once; the last checkpoint is untouched.'}", file=sys.stderr)  # noqa: T201
         return 130
-    except (CQNError, OSError) as error:
-        return int(explain("cqn-train", error, debug=debug))
+    except Exception as error:
+        plugin = plugin_at_fault(error, parser.parse_plugin_args(parser.PLUGIN_DISCOVERY_SUFFIX, arguments).values())
+        if not isinstance(error, CQNError) and plugin is not None and not debug:
+            text = " ".join(str(error).split())[:300]
+            print(  # noqa: T201
+                f"cqn-train: error: the plugin '{plugin}' failed: {type(error).__name__}: {text} (--debug shows where)",
+                file=sys.stderr,
+            )
+            return 1
+        if isinstance(error, CQNError | OSError):
+            return int(explain("cqn-train", error, debug=debug))
+        raise
 
 
 def run(valid: ValidRun) -> int:

@@ -31,10 +31,10 @@ __all__ = [
 class Recipe:
     """Schedule of a run, where the paper gives each method numbers of its own; the defaults are CQN's on RLBench."""
 
-    updates_per_step: int = number(1, least=0)  # after each control step
-    updates_per_episode: int = number(0, least=0)  # between episodes
-    batch_size: int = number(256, least=0)  # from everything seen
-    demo_batch_size: int = number(256, least=0)  # from demonstrations and successes, on top
+    updates_per_step: int = number(1, least=0, most=1000)  # after each control step
+    updates_per_episode: int = number(0, least=0, most=100_000)  # between episodes
+    batch_size: int = number(256, least=0, most=65_536)  # from everything seen
+    demo_batch_size: int = number(256, least=0, most=65_536)  # from demonstrations and successes, on top
     relabel: bool = True  # successful online episodes become demonstrations
     action_bounds: str = "data"  # action -1..1 is the demonstrations' range, or that of the "environment"
 
@@ -172,6 +172,8 @@ class RunConfig:
             )
         for settings, prefix in ((self, ""), (recipe, ""), (self.eval, "eval."), (self.replay, "replay.")):
             check_ranges(settings, prefix)
+        if self.wandb.mode not in (None, *(modes := ("online", "offline", "disabled"))):
+            raise ConfigError(one_of("wandb.mode", str(self.wandb.mode), modes))
         if self.replay.sampling not in (valid := ("episodes", "steps")):
             raise ConfigError(one_of("replay.sampling", self.replay.sampling, valid))
         if recipe.action_bounds not in (valid := ("data", "environment")):
@@ -186,6 +188,9 @@ class RunConfig:
         if self.env is not None:
             if self.teleop is not None:
                 raise ConfigError("--teleop.type is the leader of an arm: give --robot.type as well, or leave it out.")
+            for name, given, usual in (("arm", self.arm, ArmSettings()), ("page", self.page, PageSettings())):
+                if given != usual:
+                    raise ConfigError(f"--{name}.… has no effect in an environment, only on an arm: leave it out.")
             return self.env
         if self.robot is None:
             raise ConfigError(

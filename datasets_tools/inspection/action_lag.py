@@ -71,7 +71,7 @@ class Follow:
         self._level = Correlation(joints)
         self._steps = [Correlation(joints) for _ in self._lags]  # of a change of command and of the state
         self._values = [Correlation(joints) for _ in self._lags]  # of a command itself and a change of the state
-        self._gap, self._count = np.zeros(joints), 0
+        self._gap, self._pace, self._count = np.zeros(joints), np.zeros(joints), 0
 
     @classmethod
     def of(cls, source: Source) -> Self | None:
@@ -88,6 +88,7 @@ class Follow:
         if len(a) < 3:
             return
         self._gap += np.abs(a - s).sum(axis=0)
+        self._pace += np.abs(np.diff(s, axis=0)).sum(axis=0)
         self._count += len(a)
         self._level.add(a[:-1], s[1:])
         moved = np.diff(s, axis=0, prepend=s[:1])  # row t: s[t] - s[t-1]
@@ -103,6 +104,10 @@ class Follow:
     def gap(self) -> Array:
         """(J,) mean absolute difference of command and measurement at the same step."""
         return self._gap / max(1, self._count)
+
+    def pace(self) -> Array:
+        """(J,) mean absolute change of the state in a step."""
+        return self._pace / max(1, self._count)
 
     def kind(self) -> FollowKind:
         """Likely kind of the actions: positions, differences, or something else (end-effector poses, rates)."""

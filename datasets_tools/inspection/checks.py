@@ -31,6 +31,8 @@ JITTER = 0.05  # of a time step
 DENSE = 0.5  # share of an episode's steps with a reward, beyond which it is not one for success
 STILL = 0.25  # share of still steps that is worth removing
 LAG_S = 0.3
+FAR_SHARE, FAR_STEPS = 0.1, 3.0  # of a joint's range, and times the step, by which commands lie from the arm
+CHATTER = 1.0  # openings and closings of a gripper in a second that no hand makes for long
 SQUEEZE = 4.0  # how much wider the whole range of an action is than 98 % of its values
 PAPER_SIZE = 84  # pixels, the side of the paper's pictures
 GIB = 2**30
@@ -79,7 +81,7 @@ def findings(
         *_rewards(numbers),
         *_ranges(dataset, numbers),
         *_jumps(numbers),
-        *_grippers(numbers),
+        *_grippers(numbers, dataset.fps),
         *meaning(numbers),
         *_following(dataset, numbers),
         *_duplicates(numbers),
@@ -267,7 +269,7 @@ def _jumps(numbers: Numbers) -> Iterator[Finding]:
         yield Finding("warning", "jump", episodes_text(sorted({j.episode for j in numbers.jumps})), text, advice)
 
 
-def _grippers(numbers: Numbers) -> Iterator[Finding]:
+def _grippers(numbers: Numbers, fps: float) -> Iterator[Finding]:
     grippers = [d for d in numbers.dimensions if d.gripper]
     if not grippers:
         if numbers.dimensions:
@@ -280,6 +282,13 @@ def _grippers(numbers: Numbers) -> Iterator[Finding]:
         yield Finding("note", "idle_gripper", names_text(grippers), text, "Fine if the task needs none.")
         return
     usual = float(np.median(list(counts.values()))) if counts else 0
+    rates = {e.index: (counts.get(e.index) or 0) * fps / e.steps for e in numbers.episodes}
+    busy = [i for i, rate in rates.items() if rate > CHATTER and (counts[i] or 0) > 3]
+    if len(busy) > len(rates) / 2:  # else those few are odd among the others
+        text = f"The gripper opens and closes up to {max(rates.values()):.1f} times a second: {names_text(grippers)}."
+        advice = "A command that flickers is learned as such; look at it, and smooth or record again."
+        yield Finding("warning", "gripper_chatter", episodes_text(busy), text, advice)
+        return
     odd = {e: n for e, n in counts.items() if n is not None and (n > 3 * max(usual, 1) or (n == 0 and usual >= 1))}
     if odd:
         listed = ", ".join(f"episode {e}: {n}" for e, n in list(odd.items())[:NAMED])
@@ -304,6 +313,20 @@ def _following(dataset: Dataset, numbers: Numbers) -> Iterator[Finding]:
     if kind == "other":
         text = "The actions look neither like joint positions nor like their differences."
         yield Finding("note", "action_kind", ACTION, text, "End-effector commands and rates look like that.")
+    gap, pace = follow.gap(), follow.pace()
+    spans = np.array([d.high - d.low for d in numbers.of(STATE)])[list(follow.state_dims)]
+    far = (
+        np.flatnonzero((gap > FAR_SHARE * spans) & (gap > FAR_STEPS * pace) & (pace > 0)) if kind == "absolute" else ()
+    )
+    if len(far):
+        worst = max(far, key=lambda j: gap[j] / pace[j])
+        names = names_text([numbers.of(ACTION)[follow.action_dims[j]] for j in far])
+        text = (
+            f"Commands lie far from where the arm is ({names}; worst by {gap[worst]:.3g} on average, where a step moves"
+            f" it by {pace[worst]:.3g})."
+        )
+        advice = "Noise, a limit that cuts them off, or another unit; differences of such commands are as large."
+        yield Finding("warning", "far_commands", ACTION, text, advice)
     if lag is not None and lag[0] / dataset.fps > LAG_S:
         text = f"The arm follows its command only after {lag[0]} steps ({lag[0] / dataset.fps:.2f} s)."
         yield Finding("warning", "lag", ACTION, text, "Look for a delay in the control loop or in the recording.")

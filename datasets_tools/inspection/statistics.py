@@ -16,7 +16,7 @@ __all__ = ["statistics"]
 
 WHERE = "meta/stats.json"
 ADVICE = REMEDY[0].upper() + REMEDY[1:] + "."
-SLACK = 1e-3  # of the range
+SLACK, MOMENTS = 1e-3, 0.02  # of the range
 
 
 def statistics(source: Source, numbers: Numbers) -> Iterator[Finding]:
@@ -33,6 +33,37 @@ def statistics(source: Source, numbers: Numbers) -> Iterator[Finding]:
     for key in (STATE, ACTION):
         if numbers.episodes and key in source.features and key not in lacking:
             yield from _of_this_data(source, numbers, key, stats[key], bounded=bounded and key == ACTION)
+            yield from _moments(source, numbers, key, stats[key])
+    named, kept = int(source.meta.info.total_tasks), len(source.tasks)
+    if named != kept:
+        text = f"meta/info.json counts {named} tasks, meta/tasks.parquet has {kept}."
+        yield Finding(
+            "warning", "task_count", "meta/tasks.parquet", text, "Any operation of cqn-data writes both anew."
+        )
+
+
+def _moments(source: Source, numbers: Numbers, key: str, stats: Mapping[str, Any]) -> Iterator[Finding]:
+    """Mean and standard deviation, which CQN does not use and other policies do."""
+    dimensions = numbers.of(key)
+    if numbers.bad or any(len(np.reshape(stats.get(name, ()), -1)) != len(dimensions) for name in ("mean", "std")):
+        return
+    count, total, squares = 0, np.zeros(len(dimensions)), np.zeros(len(dimensions))
+    origin = np.array([d.low for d in dimensions])
+    for rows in rows_of(source.root, key):
+        count, total, squares = (
+            count + len(rows), total + (rows - origin).sum(axis=0), squares + ((rows - origin) ** 2).sum(axis=0)
+        )  # fmt: skip
+    mean = total / max(count, 1)
+    std = np.sqrt(np.maximum(squares / max(count, 1) - mean**2, 0))
+    given_mean, given_std = (np.asarray(stats[name], np.float64).reshape(-1) for name in ("mean", "std"))
+    spans = np.array([d.high - d.low for d in dimensions])
+    off = (np.abs(given_mean - mean - origin) > MOMENTS * spans + 1e-6) | (
+        np.abs(given_std - std) > MOMENTS * spans + 1e-6
+    )
+    if off.any():
+        names = names_text([d for d, o in zip(dimensions, off, strict=True) if o])
+        text = f"Mean and standard deviation of {key} are not of this data: {names}. CQN does not use them."
+        yield Finding("warning", "stale_moments", WHERE, text, f"For other policies: {ADVICE[0].lower()}{ADVICE[1:]}")
 
 
 def _of_this_data(

@@ -69,7 +69,12 @@ def parse_all(config_classes: Sequence[type], args: Sequence[str]) -> tuple[Any,
     import draccus
 
     with one_line(lambda: [f"--{f}" for f in owners], prefix="Bad option value: "):
-        return tuple(draccus.parse(c, args=flags[c]) for c in config_classes)
+        parsed = tuple(draccus.parse(c, args=flags[c]) for c in config_classes)
+    for name, (owner, _) in owners.items():
+        value = getattr(parsed[config_classes.index(owner)], name)
+        if isinstance(value, dict) and None in value.values():
+            raise ConfigError(f"Option --{name}: expected '{{name: value}}' with a space after each colon.")
+    return parsed
 
 
 def parse_choice(group: str, registry: Any, args: Sequence[str]) -> Any:
@@ -109,8 +114,9 @@ def with_plugins(args: Sequence[str]) -> list[str]:
     for flag, package in parser.parse_plugin_args(parser.PLUGIN_DISCOVERY_SUFFIX, rest).items():
         try:
             parser.load_plugin(package)
-        except parser.PluginLoadError as error:
-            raise ConfigError(f"--{flag}={package}: {error}") from error
+        except Exception as error:  # whatever its code raises; AttributeError: LeRobot takes packages only
+            why = "it is a module, expected a package (a folder)" if isinstance(error, AttributeError) else str(error)
+            raise ConfigError(f"--{flag}={package} cannot be loaded: {' '.join(why.split())[:300]}.") from error
         rest = parser.filter_arg(flag, rest)
     return rest
 

@@ -235,3 +235,26 @@ def test_a_policy_does_not_look_at_depth(tmp_path, caplog):
     make_pre_post_processors(config, dataset_stats=meta.stats)
     policy.save_pretrained(tmp_path / "policy")
     assert "depth" not in (tmp_path / "policy/config.json").read_text()
+
+
+def test_commands_that_the_arm_does_not_follow_are_said(tmp_path):
+    state = [moving(60, seed=s) for s in range(3)]
+    follows = [{STATE: s, ACTION: np.concatenate([s[1:], s[-1:]])} for s in state]
+    assert not {"far_commands", "gripper_chatter"} & set(inspect(write_columns(tmp_path / "good", follows)))
+    noise = np.random.default_rng(0)
+    shaken = [{**e, ACTION: (e[ACTION] + noise.normal(0, 6, e[ACTION].shape)).astype(np.float32)} for e in follows]
+    assert inspect(write_columns(tmp_path / "noise", shaken))["far_commands"].level == "warning"
+    cut = [{**e, ACTION: np.concatenate([e[ACTION][:, :2].clip(-1, 1), e[ACTION][:, 2:]], 1)} for e in follows]
+    assert "pan.pos" in inspect(write_columns(tmp_path / "cut", cut))["far_commands"].text
+
+
+def test_a_gripper_that_flickers_is_said(tmp_path):
+    def episode(seed):
+        state = moving(60, seed=seed)
+        command = np.concatenate([state[1:], state[-1:]])
+        command[:, 3] = 10 * (np.arange(60) % 2)
+        return {STATE: state, ACTION: command}
+
+    found = inspect(write_columns(tmp_path / "src", [episode(s) for s in range(3)]))["gripper_chatter"]
+    assert found.level == "warning"
+    assert "episodes 0, 1, 2" in found.where

@@ -132,3 +132,18 @@ def test_both_trainers_stop_before_any_update(click, tmp_path, capsys, command, 
     )  # fmt: skip
     assert "recompute_stats" in done.stderr.strip().splitlines()[-1]
     assert not (tmp_path / "lerobot/checkpoints").exists()
+
+
+def test_mean_and_deviation_of_other_data_are_said(tmp_path):
+    episodes = [{STATE: moving(40, seed=s), ACTION: moving(40, seed=s) + 1} for s in (0, 1)]
+    root = write_columns(tmp_path / "src", episodes)
+    assert "stale_moments" not in inspect(root)
+    path = root / "meta/stats.json"
+    stats = json.loads(path.read_text())
+    stats[ACTION]["std"] = [0.0] * 4
+    path.write_text(json.dumps(stats))
+    found = inspect(root)["stale_moments"]
+    assert found.level == "warning"
+    assert "CQN does not use them" in found.text
+    run("label", root, tmp_path / "dst", "--all")
+    assert "stale_moments" not in inspect(tmp_path / "dst")

@@ -107,8 +107,9 @@ def load_plan(path: Path) -> Plan:
         raise ConfigError(f"{path}: expected common as a list of --flag=value.")
     if plan.score not in (valid := ("success_rate", "mean_return")):
         raise ConfigError(f"{path}: " + one_of("score", str(plan.score), valid))
-    if not plan.seeds or not all(isinstance(seed, int) and seed >= 0 for seed in plan.seeds):
-        raise ConfigError(f"{path}: expected seeds as a list of whole numbers, got {plan.seeds}.")
+    whole = isinstance(plan.seeds, list) and all(type(seed) is int and seed >= 0 for seed in plan.seeds)
+    if not plan.seeds or not whole or len(set(plan.seeds)) < len(plan.seeds):
+        raise ConfigError(f"{path}: expected seeds as a list of different whole numbers, got {plan.seeds}.")
     return plan
 
 
