@@ -90,6 +90,9 @@ class PageSettings:
 
     host: str = "127.0.0.1"  # another one lets other machines reach the page: whoever has the token moves the arm
     port: int = number(8765, least=0, most=65535)  # 0: any free one
+    tls: bool = False  # https, by a certificate made in output_dir/page; the browser asks once whether to trust it
+    certfile: str | None = None  # https by this certificate (PEM) instead
+    keyfile: str | None = None  # its key, without a password
     # seconds without a sign of the operator's page after which the arm is paused
     absent_s: float = number(10.0, least=1, most=3600, unit="seconds")
 
@@ -206,6 +209,8 @@ class RunConfig:
                 "--updates_per_episode, or --async_updates."
             )
         check_ranges(self.page, "page.")
+        if (self.page.certfile is None) != (self.page.keyfile is None):
+            raise ConfigError("--page.certfile and --page.keyfile belong together: give both, or --page.tls=true.")
         return self.robot
 
     @property

@@ -3,6 +3,8 @@
 import ipaddress
 import json
 import secrets
+import time
+from collections import deque
 from collections.abc import Awaitable, Callable, Collection, Mapping
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -18,6 +20,7 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 LOCAL = frozenset({"localhost", "127.0.0.1", "::1"})
 ANY_ADDRESS = frozenset({"0.0.0.0", "::"})  # noqa: S104  # compared with, not bound to
 MAX_QUERY = 2048
+MOST_WRONG, LOCKED_S, MOST_ADDRESSES = 20, 60.0, 1000  # wrong tokens of an address within so many seconds
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; media-src 'self'; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -41,6 +44,7 @@ class Guard:
         self._app, self._token, self._public = app, token.encode(), frozenset(public)
         self._names = LOCAL | {host.strip("[]").lower()}
         self._any_address = host.strip("[]") in ANY_ADDRESS
+        self._wrong: dict[str, deque[float]] = {}  # by address: when its last wrong tokens came
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One connection."""
@@ -73,7 +77,7 @@ class Guard:
         if len(scope["query_string"]) > MAX_QUERY:
             return 414, "The query is too long."
         if not self._has_token(scope["query_string"], headers):
-            return 401, "The token is missing or wrong: open the page by the address that was printed, with its token."
+            return self._stranger(scope, headers)
         return None
 
     def _is_ours(self, host: str) -> bool:
@@ -82,6 +86,19 @@ class Guard:
         except ValueError:
             return False
         return name in self._names or (self._any_address and _is_address(name))
+
+    def _stranger(self, scope: Scope, headers: Mapping[bytes, bytes]) -> tuple[int, str]:
+        """Answer to who has no right token: another one where an address gave more than a person does by mistake."""
+        told = 401, "The token is missing or wrong: open the page by the address that was printed, with its token."
+        if b"token=" not in scope["query_string"] and b"x-token" not in headers:  # no guess
+            return told
+        address, now = str((scope.get("client") or ("",))[0]), time.monotonic()
+        if len(self._wrong) > MOST_ADDRESSES:
+            self._wrong.clear()
+        times = self._wrong.setdefault(address, deque(maxlen=MOST_WRONG + 1))
+        times.append(now)
+        locked = len(times) > MOST_WRONG and now - times[0] < LOCKED_S
+        return (429, f"Too many wrong tokens: wait {LOCKED_S:.0f} s. The right one is let in.") if locked else told
 
     def _has_token(self, query: bytes, headers: Mapping[bytes, bytes]) -> bool:
         try:

@@ -13,9 +13,11 @@ from urllib.parse import quote
 from lerobot_cqn.errors import ConfigError
 
 from .access import ANY_ADDRESS
+from .connections import bounded_protocol
 from .routes import MAX_BODY
+from .tls import Certificate
 
-__all__ = ["PageServer"]
+__all__ = ["PageServer", "own_address"]
 
 MIN_TOKEN = 8  # characters
 START_S = 15.0
@@ -27,7 +29,7 @@ class PageServer:
 
     name: of the page, for errors and its thread. host: address to listen on; 0.0.0.0 lets other machines reach it.
     port: 0 takes any free one, which `port` then says. token: what a request must bring; None makes one. ended: called
-    when nothing is served any more.
+    when nothing is served any more. certificate: for https.
 
     Raises ConfigError when made: for a port in use, for a short token.
     """
@@ -40,6 +42,7 @@ class PageServer:
         port: int = 0,
         token: str | None = None,
         ended: Callable[[], None] = lambda: None,
+        certificate: Certificate | None = None,
     ) -> None:
         if token is not None and len(token) < MIN_TOKEN:
             raise ConfigError(f"The page's token has {len(token)} characters: expected at least {MIN_TOKEN}.")
@@ -48,14 +51,17 @@ class PageServer:
         app = make_app(self.token)
         self._socket = _listen(host, port)
         self.port: int = self._socket.getsockname()[1]
-        self._server = _quiet_server(app)
+        self._scheme = "http" if certificate is None else "https"
+        self._server = _quiet_server(app, certificate)
         self._thread = threading.Thread(target=self._run, name=name.replace(" ", "-"), daemon=True)
 
     @property
     def url(self) -> str:
         """Address of the page, with its token."""
-        host = _own_address() if self.host in ANY_ADDRESS else self.host
-        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/?token={quote(self.token, safe='')}"
+        host = own_address() if self.host in ANY_ADDRESS else self.host
+        return (
+            f"{self._scheme}://{f'[{host}]' if ':' in host else host}:{self.port}/?token={quote(self.token, safe='')}"
+        )
 
     def __enter__(self) -> Self:
         """Start; returns when the page can be opened. Raises ConfigError where it does not start."""
@@ -92,11 +98,13 @@ class PageServer:
             self._ended()
 
 
-def _quiet_server(app: Any) -> Any:
+def _quiet_server(app: Any, certificate: Certificate | None) -> Any:
     import uvicorn
 
+    certfile, keyfile = certificate or (None, None)
     config = uvicorn.Config(
-        app, log_config=None, access_log=False, log_level="critical", server_header=False, lifespan="on",
+        app, http=bounded_protocol(), ssl_certfile=certfile, ssl_keyfile=keyfile,
+        log_config=None, access_log=False, log_level="critical", server_header=False, lifespan="on",
         ws_max_size=MAX_BODY, ws_max_queue=8, ws_ping_interval=5.0, ws_ping_timeout=10.0, timeout_keep_alive=5,
         timeout_graceful_shutdown=int(CLOSE_S), proxy_headers=False,
     )  # fmt: skip
@@ -125,7 +133,7 @@ def _listen(host: str, port: int) -> socket.socket:
     return listening
 
 
-def _own_address() -> str:
+def own_address() -> str:
     """The address by which other machines reach this one; nothing is sent to find it."""
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect(("192.0.2.1", 9))

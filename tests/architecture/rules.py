@@ -49,7 +49,7 @@ FLOORS: dict[str, str] = {
 OPTIONAL = frozenset(
     {
         "mujoco", "matplotlib", "wandb", "tensorboard", "fastapi", "uvicorn", "h5py", "zarr", "rliable", "metaworld",
-        "dm_control", "gym_hil", "gym_pusht", "gym_aloha", "rlbench", "pyrep",
+        "dm_control", "cryptography", "gym_hil", "gym_pusht", "gym_aloha", "rlbench", "pyrep",
     }
 )  # fmt: skip
 # Modules that need one at their top; they in turn are imported only inside functions or by one another.

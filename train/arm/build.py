@@ -17,11 +17,14 @@ from lerobot.teleoperators.utils import make_teleoperator_from_config
 from lerobot.utils.constants import ACTION, OBS_STATE
 from numpy.typing import NDArray
 
+from cqn_data.web.access import ANY_ADDRESS
+from cqn_data.web.server import own_address
+from cqn_data.web.tls import Certificate, check_certificate, own_certificate
 from lerobot_cqn.errors import ConfigError, DataError, one_of
 
 from ..agent import Agent
 from ..clock import REAL, Clock
-from ..config import RunConfig
+from ..config import PageSettings, RunConfig
 from ..interfaces import PAGE_TOKEN
 from ..operator.board import Board
 from ..operator.session import Session
@@ -108,9 +111,22 @@ def steering(config: RunConfig, operated: Operated, say: Callable[[str], None]) 
     from ..operator.page.server import OperatorServer
 
     page, token = config.page, os.environ.get(PAGE_TOKEN) or None
-    with OperatorServer(operated.board, page.host, page.port, token, page.absent_s) as server:
+    certificate = _certificate(page, config.output_dir, say)
+    with OperatorServer(operated.board, page.host, page.port, token, page.absent_s, certificate=certificate) as server:
         say(f"Operator's page: {server.url}")
         yield
+
+
+def _certificate(page: PageSettings, output_dir: Path | None, say: Callable[[str], None]) -> Certificate | None:
+    """For https where it was asked for. Raises ConfigError for files that cannot be used."""
+    if page.certfile and page.keyfile:
+        return check_certificate(page.certfile, page.keyfile)
+    if not page.tls or output_dir is None:
+        return None
+    hosts = ["localhost", "127.0.0.1", own_address(), *([] if page.host in ANY_ADDRESS else [page.host])]
+    made, fingerprint = own_certificate(output_dir / "page", hosts)
+    say(f"Certificate: {made[0]}, SHA-256 {fingerprint}; the browser shows the same before you trust it.")
+    return made
 
 
 def recall(board: Board, output_dir: Path) -> None:
