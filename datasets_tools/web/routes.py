@@ -59,7 +59,8 @@ def add_errors(app: "FastAPI", statuses: Mapping[type[Exception], int]) -> None:
 
     app.add_exception_handler(HTTPException, not_found)
     app.add_exception_handler(RequestValidationError, invalid)
-    for kind, status in {NonsenseError: 422, **statuses}.items():
+    handle(NonsenseError, 422)
+    for kind, status in statuses.items():
         handle(kind, status)
 
 
