@@ -36,6 +36,7 @@ class RLConfig(PreTrainedConfig):
     state_bound: float | None = None
     # Action
     action_margin: float | None = None
+    bound_margin: float | None = None
     # Networks
     encoder_channels: tuple[int, ...] | None = None
     feature_dim: int | None = None

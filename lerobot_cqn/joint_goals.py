@@ -1,7 +1,9 @@
 """From a policy's joint differences to an arm's absolute goals and back, in the robot's units.
 
-What a difference is, the dataset's history says (`delta_actions`). Two steps do it around the policy, so that every
-command of LeRobot that drives a robot sends goals: one remembers the joints, the other adds the differences to them.
+What was recorded is what robot and environment take: goals, or differences where `cqn-data record` says so. What the
+policy learned from is what the dataset's history ends with (`delta_actions`). Where the two differ, two steps around
+the policy bring one to the other, in every command of LeRobot: one remembers the joints, the other adds differences to
+them, or takes them off goals.
 """
 
 from collections.abc import Sequence
@@ -25,10 +27,13 @@ from .schema import read_history
 
 __all__ = [
     "DeltaToGoalProcessorStep",
+    "GoalToDeltaProcessorStep",
     "RememberJointsProcessorStep",
     "action_of",
     "converted_deltas",
     "goal_of",
+    "recorded_deltas",
+    "undone_deltas",
 ]
 
 
@@ -163,6 +168,52 @@ class DeltaToGoalProcessorStep(AbsoluteActionsProcessorStep):
             self._before = torch.zeros_like(like, dtype=state.dtype, device=state.device)
             self._before[..., list(self.deltas.action_dims)] = state[..., list(self.deltas.state_dims)]
         return state, self._before
+
+
+@ProcessorStepRegistry.register(name="cqn_goal_to_delta")
+class GoalToDeltaProcessorStep(DeltaToGoalProcessorStep):
+    """Turns a goal [K, D] into the differences [K, D] that an environment takes; otherwise as its base."""
+
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        """Action that asks for the goal. Raises DataError when no state was seen in this episode."""
+        goal = transition.get(TransitionKey.ACTION)
+        if not isinstance(goal, Tensor):
+            return transition
+        changed = transition.copy()
+        changed[TransitionKey.ACTION] = self.action_of(goal)
+        self._goal = goal.detach().clone()
+        return changed
+
+
+def recorded_deltas(dataset_meta: Any) -> Any:
+    """Description of the differences that the environment of the demonstrations takes; None: goals, or not known.
+
+    dataset_meta: as of `converted_deltas`.
+    """
+    if dataset_meta is None:
+        return None
+    entries = read_history(Path(dataset_meta.root))
+    return next((e["deltas"] for e in entries if e.get("operation") == "record" and e.get("deltas")), None)
+
+
+def undone_deltas(dataset_meta: Any) -> DeltaJoints | None:
+    """Differences that the environment takes, where `cqn-data delta --to=absolute` made goals of them; else None.
+
+    dataset_meta: as of `converted_deltas`.
+    Raises DataError as it does, and where the goals were made differences of another kind.
+    """
+    recorded = recorded_deltas(dataset_meta)
+    if recorded is None:
+        return None
+    now = current_description(read_history(Path(dataset_meta.root)))
+    if now == recorded:
+        return None
+    if now is not None:
+        raise DataError(
+            f"{dataset_meta.root}: the environment takes differences of kind '{recorded['kind']}', the dataset now has"
+            f" '{now['kind']}', which cannot be driven there: make the actions absolute, or use the first recording."
+        )
+    return parse(recorded, dataset_meta.features, Path(dataset_meta.root))
 
 
 def converted_deltas(dataset_meta: Any) -> DeltaJoints | None:

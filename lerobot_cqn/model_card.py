@@ -321,6 +321,7 @@ def _features(facts: ModelFacts) -> str:
     if not actions:
         return text + "; its processors hold the bounds."
     margin = f", widened by {s.action_margin:g} of the range on each side" if s.action_margin else ""
+    margin += f", widened by {s.bound_margin:g} of each bound's absolute value" if s.bound_margin else ""
     return f"{text}; these bounds{margin}:\n\n" + rows_of(
         ("dimension", "action", "lower bound", "upper bound"), actions
     )

@@ -30,7 +30,13 @@ from lerobot.utils.constants import (
 from .base_config import RLConfig
 from .errors import DataError
 from .fit_pictures import FitPicturesProcessorStep
-from .joint_goals import DeltaToGoalProcessorStep, RememberJointsProcessorStep, converted_deltas
+from .joint_goals import (
+    DeltaToGoalProcessorStep,
+    GoalToDeltaProcessorStep,
+    RememberJointsProcessorStep,
+    converted_deltas,
+    undone_deltas,
+)
 from .scaling_check import check_scaling
 from .schema import BOUND_PROCESSOR
 
@@ -72,11 +78,12 @@ class BoundObservationProcessorStep(ObservationProcessorStep):
         return features
 
 
-def scaling_stats(stats: Stats, margin: float, *, inverse: bool) -> Stats:
+def scaling_stats(stats: Stats, margin: float, *, inverse: bool, bound_margin: float = 0.0) -> Stats:
     """Statistics made safe for MIN_MAX scaling of state and action.
 
     A constant dimension (min == max) maps to 0; with `inverse`, any value maps back to the constant.
-    margin widens the bounds of the action on both sides by this share of their range.
+    margin widens the bounds of the action on both sides by this share of their range, bound_margin by this share of
+    each bound's absolute value, as the authors' code does.
     """
     safe: Stats = {}
     for key, entry in stats.items():
@@ -85,9 +92,11 @@ def scaling_stats(stats: Stats, margin: float, *, inverse: bool) -> Stats:
             continue
         low, high = np.asarray(entry["min"], dtype=np.float64), np.asarray(entry["max"], dtype=np.float64)
         widen = margin * (high - low) if key == ACTION else 0.0
+        own = bound_margin if key == ACTION else 0.0
         constant = high - low <= 1e-8 * np.maximum(1.0, np.abs(low))
         spread = np.where(constant, 0.0 if inverse else 1.0, widen)
-        safe[key]["min"], safe[key]["max"] = low - spread, high + spread
+        below, above = (np.where(constant, spread, widen + own * np.abs(end)) for end in (low, high))
+        safe[key]["min"], safe[key]["max"] = low - below, high + above
         if inverse:  # exactly equal, so that LeRobot's inverse returns the constant
             safe[key]["max"] = np.where(constant, safe[key]["min"], safe[key]["max"])
     return safe
@@ -102,15 +111,15 @@ def make_processors(
     """Pipelines around the policy, under the step names LeRobot overrides by.
 
     dataset_stats: LeRobot's statistics (`min`, `max`, `mean`, `std` per feature); None leaves values as they are.
-    dataset_meta: LeRobot's metadata of the dataset; where its absolute actions were turned into deltas, the pipelines
-        turn the policy's back into absolute goals. By default the one that the policy was made for.
+    dataset_meta: LeRobot's metadata of the dataset; where its actions are no longer what was recorded, goals or
+        differences, the pipelines turn the policy's back into those. By default the one the policy was made for.
     Raises DataError where the dataset's history is damaged, or statistics are missing or not those of its data.
     """
     # lerobot-train hands the metadata to `make_policy` only, which leaves it here.
     meta = getattr(config, "_runtime_dataset_meta", None) if dataset_meta is None else dataset_meta
     remember, to_goal = _goal_steps(meta)
     stats = _tensors_to_numpy(dataset_stats or {})
-    margin = config.settings.action_margin
+    margin, own = config.settings.action_margin, config.settings.bound_margin
     features: dict[str, PolicyFeature] = {**(config.input_features or {}), **(config.output_features or {})}
     if meta is not None and ACTION in meta.features:
         bound = config.settings.state_bound if OBS_STATE in features else None
@@ -126,7 +135,7 @@ def make_processors(
             NormalizerProcessorStep(
                 features=features,
                 norm_map=norm_map,
-                stats=scaling_stats(stats, margin, inverse=False),
+                stats=scaling_stats(stats, margin, inverse=False, bound_margin=own),
                 device=config.device,
             ),
             BoundObservationProcessorStep(bound=config.settings.state_bound),
@@ -138,7 +147,7 @@ def make_processors(
             UnnormalizerProcessorStep(
                 features=config.output_features or {},
                 norm_map=norm_map,
-                stats=scaling_stats(stats, margin, inverse=True),
+                stats=scaling_stats(stats, margin, inverse=True, bound_margin=own),
             ),
             *to_goal,
             DeviceProcessorStep(device="cpu"),
@@ -151,11 +160,13 @@ def make_processors(
 
 
 def _goal_steps(dataset_meta: Any) -> tuple[list[ProcessorStep], list[ProcessorStep]]:
-    deltas = converted_deltas(dataset_meta)
+    made, undone = converted_deltas(dataset_meta), undone_deltas(dataset_meta)
+    deltas = made or undone
     if deltas is None:
         return [], []
     remember = RememberJointsProcessorStep()
-    return [remember], [DeltaToGoalProcessorStep(deltas.kind, deltas.action_dims, deltas.state_dims, remember)]
+    step = DeltaToGoalProcessorStep if made is not None else GoalToDeltaProcessorStep
+    return [remember], [step(deltas.kind, deltas.action_dims, deltas.state_dims, remember)]
 
 
 def _picture_steps(features: dict[str, PolicyFeature]) -> list[ProcessorStep]:

@@ -26,6 +26,7 @@ class CommonSettings:
     state_bound: float = 2.0  # normalised state is cut here: demonstrations span [-1, 1]
     # Action
     action_margin: float = number(0.0, least=0)  # widens the action bounds by this share of the range, on each side
+    bound_margin: float = number(0.0, least=0)  # the same by this share of each bound's own absolute value
     # Networks
     encoder_channels: tuple[int, ...] = (32, 64, 128, 256)  # of each convolution, stride 2; one encoder a camera
     feature_dim: int = number(64, least=1)  # size of the projections of pictures and of numbers, before the trunk
@@ -124,7 +125,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper_dmc_state": {**_DMC, "frame_stack": 1},
     "paper_dmc_pixels": {**_DMC, "frame_stack": 3},
     # The authors' implementation where it differs from the paper (docs/algorithm.md).
-    "reference_rlbench": {"n_step": 1, "v_min": -2.0, "v_max": 2.0, "action_margin": 0.2},
+    "reference_rlbench": {"n_step": 1, "v_min": -2.0, "v_max": 2.0, "bound_margin": 0.2},
     # Ours: joints and object poses, no camera, a laptop. Small network, one frame, larger steps.
     "laptop_state": {"frame_stack": 1, "hidden_dim": 256, "lr": 3e-4},
     # Ours: two small cameras on a laptop or one GPU.

@@ -18,6 +18,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot_cqn.errors import ConfigError, OutputExistsError
 from lerobot_cqn.joint_goals import converted_deltas
 from lerobot_cqn.learner import Learner
+from lerobot_cqn.schema import read_history
 
 from .agent import Agent
 from .arm.build import make_operated, recall, steering
@@ -213,6 +214,7 @@ def new_agent(run: ValidRun, data: Demonstrations | None, env_bounds: Bounds | N
     policy: Any = make_policy(run.policy, **source)
     # Of the opened dataset: its rows are on this disk from here on.
     stats: dict[str, Any] = {} if data is None else dict(data.dataset.meta.stats or {})
+    check_actions(run, meta)
     if run.config.recipe.action_bounds == "environment":
         if meta is not None and converted_deltas(meta) is not None:
             raise ConfigError(
@@ -222,6 +224,24 @@ def new_agent(run: ValidRun, data: Demonstrations | None, env_bounds: Bounds | N
             raise ConfigError("The environment bounds no action: give --action_bounds=data and a dataset.")
         stats[ACTION] = env_bounds
     return Agent(policy, *make_pre_post_processors(run.policy, dataset_stats=stats, dataset_meta=meta))
+
+
+def check_actions(run: ValidRun, meta: Any) -> None:
+    """Whether the environment takes what was recorded: goals, or differences, each as far as it is known.
+
+    Raises ConfigError where it does not.
+    """
+    takes = getattr(run.acts_in, "action_kind", "")
+    entries = read_history(Path(meta.root)) if meta is not None else []
+    origin = next((entry for entry in entries if entry.get("operation") in ("record", "convert")), None)
+    if not takes or origin is None:
+        return
+    recorded = "differences" if origin["operation"] == "record" and origin.get("deltas") else "goals"
+    if recorded != takes:
+        raise ConfigError(
+            f"The demonstrations' actions were recorded as {recorded}, and --env.type={run.acts_in.type} takes {takes}:"
+            " give the environment that they were recorded in, or demonstrations of this one."
+        )
 
 
 # -- the run's folder ----------------------------------------------------------------------------------------

@@ -50,7 +50,10 @@ def test_presets_are_the_defaults_with_their_column_on_top(preset: str) -> None:
         ("paper_real_world", {"frame_stack": 4, "levels": 4, "bins": 3, "rl_loss_scale": 0.1, "shift_pixels": 4}),
         ("paper_dmc_state", {"frame_stack": 1, "v_min": 0, "v_max": 200, "exploration_noise": 0.1}),
         ("paper_dmc_pixels", {"frame_stack": 3, "bc_loss_scale": 0, "rl_loss_scale": 1}),
-        ("reference_rlbench", {"n_step": 1, "v_min": -2, "v_max": 2, "action_margin": 0.2, "frame_stack": 8}),
+        (
+            "reference_rlbench",
+            {"n_step": 1, "v_min": -2, "v_max": 2, "bound_margin": 0.2, "action_margin": 0, "frame_stack": 8},
+        ),
     ],
 )
 def test_published_numbers(preset: str, expected: dict[str, float]) -> None:
@@ -72,7 +75,7 @@ def test_unknown_presets_suggest_a_known_one() -> None:
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [
-        ("levels", 0, "`levels` must be at least 1, got 0"),
+        ("levels", 0, "`levels` must be 1 to 16, got 0"),
         ("bins", 1, "`bins` must be at least 2, got 1"),
         ("atoms", 1, "`atoms` must be at least 2"),
         ("n_step", 0, "`n_step` must be 1 to 1000"),
@@ -182,7 +185,7 @@ def test_runs_are_checked() -> None:
 
     validate()
     for option in ("steps", "offline_updates", "batch_size", "updates_per_step"):
-        with pytest.raises(ConfigError, match=f"`{option}` must be at least 0, got -1"):
+        with pytest.raises(ConfigError, match=rf"`{option}` must be (at least 0|0 to \d+), got -1"):
             validate(f"--{option}=-1")
     for option, most, values in (("seed", 20_000, (-1, 20_001, 10**20)), ("threads", 256, (-1, 257, 100_000))):
         for value in values:

@@ -23,10 +23,12 @@ from lerobot_cqn.delta_actions import KINDS, DeltaJoints
 from lerobot_cqn.errors import DataError
 from lerobot_cqn.joint_goals import (
     DeltaToGoalProcessorStep,
+    GoalToDeltaProcessorStep,
     RememberJointsProcessorStep,
     action_of,
     converted_deltas,
     goal_of,
+    undone_deltas,
 )
 from lerobot_cqn.schema import HISTORY
 
@@ -148,6 +150,43 @@ OTHER = {"operation": "label", "settings": {}}
 ])  # fmt: skip
 def test_what_the_history_says(entries: list[dict[str, Any]], kind: str | None, tmp_path: Path) -> None:
     assert converted_deltas(history(tmp_path, *entries)) == deltas(kind)
+
+
+@pytest.mark.parametrize(("entries", "kind"), [
+    ([], None),
+    ([entry("delta", "command"), entry("delta", None)], None),
+    ([entry("record", "command_steps"), OTHER], None),
+    ([entry("record", "command_steps"), entry("delta", None), OTHER], "command_steps"),
+    ([entry("record", "command"), entry("delta", None), entry("delta", "command")], None),
+])  # fmt: skip
+def test_differences_that_were_undone_are_what_the_environment_takes(
+    entries: list[dict[str, Any]], kind: str | None, tmp_path: Path
+) -> None:
+    assert undone_deltas(history(tmp_path, *entries)) == deltas(kind)
+
+
+def test_differences_of_another_kind_than_recorded_are_refused(tmp_path: Path) -> None:
+    meta = history(tmp_path, entry("record", "command_steps"), entry("delta", None), entry("delta", "command"))
+    with pytest.raises(DataError, match="takes differences of kind 'command_steps', the dataset now has 'command'"):
+        undone_deltas(meta)
+
+
+@kinds
+@given(seed=st.integers(0, 10**6))
+def test_goals_become_the_differences_that_were_recorded(kind: Any, seed: int) -> None:
+    """Over whole episodes: what `cqn-data delta --to=absolute` made of a recording is driven as it was recorded."""
+    remember = RememberJointsProcessorStep()
+    to_delta = GoalToDeltaProcessorStep(kind, ACTION_DIMS, STATE_DIMS, remember)
+    for number in range(2):
+        state, goals = episodes(seed + number, 3)
+        written, led = (torch.from_numpy(v) for v in as_deltas(state, goals, kind))
+        remember.reset()
+        to_delta.reset()
+        for t in range(T):
+            remember({"observation": {"observation.state": torch.from_numpy(state[:, t])}})  # type: ignore[typeddict-item]
+            for _ in range(2):  # asked twice in a step, the answer is the same
+                action = to_delta({"action": led[:, t]})["action"]  # type: ignore[typeddict-item]
+                torch.testing.assert_close(action, written[:, t], rtol=0, atol=1e-9)
 
 
 def test_without_history_or_dataset_nothing_is_converted(tmp_path: Path) -> None:

@@ -80,6 +80,13 @@ def test_margin_widens_the_actions_and_not_the_state() -> None:
     torch.testing.assert_close(scaled, torch.tensor([[2 / 3, 0, 2 / 3]]))
 
 
+def test_a_share_of_each_bound_widens_as_the_reference_does() -> None:
+    """Its rule: low - 0.2 |low|, high + 0.2 |high|; a bound of 0 stays, a constant too."""
+    _, post = make(bound_margin=0.2)
+    torch.testing.assert_close(post(torch.tensor([[-1.0, 1, -1], [1, 1, 1]])),
+                               torch.tensor([[-1.2, 0.25, 1.6], [3.6, 0.25, 3.0]]))  # fmt: skip
+
+
 @pytest.mark.parametrize("bound", [1.0, 2.0, 5.0])
 def test_states_outside_the_demonstrations_are_bounded(bound: float) -> None:
     pre, _ = make(state_bound=bound)

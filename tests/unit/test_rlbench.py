@@ -17,6 +17,8 @@ from cqn_train.envs.rlbench import RLBenchGym
 from cqn_train.envs.rlbench_config import CAMERAS, TASKS
 from lerobot_cqn.errors import ConfigError, DataError
 
+HOME = np.array([-0.5, -0.5, -0.5, -1.0, -0.5, 1.0, -0.5])  # within the Panda's limits, whatever is added
+
 
 class InvalidActionError(Exception):
     pass
@@ -42,7 +44,7 @@ class FakeObservationConfig:
 
 
 class FakeTask:
-    """Joints add up the deltas; the task succeeds in its third step."""
+    """Joints reach their goals; the task succeeds in its third step."""
 
     def __init__(self, environment, task_class):
         self.environment, self.task_class, self.variation = environment, task_class, None
@@ -54,14 +56,14 @@ class FakeTask:
         self.variation = number
 
     def reset(self):
-        self.joints, self.steps, self.actions = np.random.random(7), 0, []
+        self.joints, self.steps, self.actions = np.random.random(7) * [1, 1, 1, -1, 1, 1, 1] + HOME, 0, []
         return [f"variation {self.variation}", "said otherwise"], self._observation(1.0)
 
     def step(self, action):
-        if action[0] > 0.4:
+        if action[0] - self.joints[0] > 0.15:
             raise InvalidActionError("cannot be reached")
         self.actions.append(action)
-        self.joints = self.joints + action[:7]
+        self.joints = np.array(action[:7])
         self.steps += 1
         success = self.steps == 3
         return self._observation(action[7]), float(success), success
@@ -131,7 +133,7 @@ def test_the_simulator_is_asked_for_what_the_paper_uses(fake_rlbench):
     made = fake_rlbench[0]
     assert made.action_mode == (
         "MoveArmThenGripper",
-        {"arm_action_mode": ("JointPosition", {"absolute_mode": False}), "gripper_action_mode": ("Discrete", {})},
+        {"arm_action_mode": ("JointPosition", {"absolute_mode": True}), "gripper_action_mode": ("Discrete", {})},
     )
     assert (made.headless, made.launched) == (True, 1)
     assert (made.task.task_class.__name__, made.task.variation) == ("TakeLidOffSaucepan", 2)
@@ -156,9 +158,10 @@ def test_an_episode(fake_rlbench):
     assert {**shapes, "action": (8,)} == {name: tuple(f.shape) for name, f in config.features.items()}
     assert env.unwrapped.task_description == "variation 0"
     assert env.spec.max_episode_steps == 100
-    action = np.array([0.1, -9.0, *[0.0] * 5, 0.0], np.float32)
+    action = np.append(observation["agent_pos"][:7] + np.array([0.1, -9.0, *[0.0] * 5]), 0.0).astype(np.float32)
     following, reward, terminated, _, info = env.step(action)
-    assert following["agent_pos"][:7] - observation["agent_pos"][:7] == pytest.approx([0.1, -0.5, 0, 0, 0, 0, 0])
+    moved = following["agent_pos"][:7] - observation["agent_pos"][:7]
+    assert moved == pytest.approx([0.1, -0.2, 0, 0, 0, 0, 0], abs=1e-6)
     assert (observation["agent_pos"][7], following["agent_pos"][7]) == (1.0, 0.0)
     assert (reward, terminated, info["is_success"]) == (0.0, False, False)
     assert env.render().shape == (32, 32, 3)
@@ -171,8 +174,8 @@ def test_an_episode(fake_rlbench):
 def test_a_refused_action_ends_the_episode_as_a_failure(fake_rlbench):
     env = RLBenchGym(image_size=32)
     before, _ = env.reset(seed=0)
-    action = np.zeros(8)
-    action[0] = 0.45
+    action = before["agent_pos"].astype(np.float64)
+    action[0] += 0.18
     observation, reward, terminated, _, info = env.step(action)
     assert (reward, terminated, info["is_success"]) == (0.0, True, False)
     assert np.array_equal(observation["agent_pos"], before["agent_pos"])

@@ -53,6 +53,7 @@ class SimEnvConfig(EnvConfig):
     known_cameras: ClassVar[tuple[str, ...]] = ()  # names of all there are; () where pictures have none
     rates: ClassVar[tuple[int, ...]] = ()  # values of fps that there are; () where it follows from other fields
     rates_are: ClassVar[str] = ""  # why there are no others
+    action_kind: ClassVar[str] = ""  # "goals", "differences", or "": neither, or said by the recording
 
     obs_type: str = "state"  # state (no cameras), pixels (no simulator state) or both
     cameras: list[str] = field(default_factory=list)

@@ -5,19 +5,24 @@ and tested with a stand-in, not with the simulator.
 """
 
 import weakref
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_cqn.errors import ConfigError, DataError
 
 from .rlbench_config import CAMERAS, RLBenchEnv
-from .sim_env import Observation, SimEnv, box_with_gripper, preserved_numpy_random
+from .sim_env import Observation, SimEnv, preserved_numpy_random
 
-__all__ = ["MAX_DELTA", "RLBenchGym"]
+__all__ = ["LIMITS", "RLBenchGym"]
 
-MAX_DELTA = 0.5  # rad a step; far more than the arm can follow, to stop only wild actions
+# Joint limits of the Franka Panda in rad, by its maker's data sheet.
+LIMITS = np.array(
+    [[-2.8973, 2.8973], [-1.7628, 1.7628], [-2.8973, 2.8973], [-3.0718, -0.0698], [-2.8973, 2.8973], [-0.0175, 3.7525],
+     [-2.8973, 2.8973]], np.float32,
+)  # fmt: skip
 _ALL_CAMERAS = (*CAMERAS, "overhead")
 _JOINTS = 7
 # As `cqn-data convert` names them in RLBench's own recordings.
@@ -39,8 +44,9 @@ class _Modules(NamedTuple):
 class RLBenchGym(SimEnv):
     """A Franka Panda in CoppeliaSim, headless at 20 Hz; sparse reward. One of these a process.
 
-    Action, (8,) float32: seven joint deltas in rad on the measured joints, within 0.5 rad, and the gripper, 0 (closed)
-    to 1 (open), RLBench's convention; it opens above 0.5. Values out of range are clipped.
+    Action, (8,) float32: goals of seven joints in rad, as RLBench's own recordings hold them, and the gripper, 0
+    (closed) to 1 (open), RLBench's convention; it opens above 0.5. Values out of range are clipped, and goals to within
+    `max_delta` of the measured joints. A policy of differences comes here with its differences added to the joints.
 
     Observation:
         agent_pos: (8,) float32, seven joint angles in rad and whether the gripper is open, 0 or 1.
@@ -52,10 +58,7 @@ class RLBenchGym(SimEnv):
     Attributes:
         task, task_description: name of the task, and RLBench's first sentence for it, once an episode has begun.
         state_names, action_names: of `agent_pos` and the action.
-        action_kind: what the joint deltas are differences of, as `cqn-data delta --help` names it.
     """
-
-    action_kind: ClassVar[str] = "command"
 
     def __init__(self, **settings: Any) -> None:
         """Start CoppeliaSim with the scene that fields of `RLBenchEnv` name.
@@ -70,11 +73,13 @@ class RLBenchGym(SimEnv):
         self.task_description = self.task.replace("_", " ")
         self.state_names = list(_NAMES)
         self.action_names = list(_NAMES)
-        self.action_space = box_with_gripper(_JOINTS, MAX_DELTA)
+        low, high = (np.append(LIMITS[:, end], gripper) for end, gripper in ((0, 0), (1, 1)))
+        self.action_space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+        self._max_delta = config.max_delta
         self._last: Observation = {}
         self._simulator = modules.environment.Environment(
             action_mode=modules.action_mode.MoveArmThenGripper(
-                arm_action_mode=modules.arm.JointPosition(absolute_mode=False),
+                arm_action_mode=modules.arm.JointPosition(absolute_mode=True),
                 gripper_action_mode=modules.gripper.Discrete(),
             ),
             obs_config=_wanted(modules, self._camera_names, config.image_size),
@@ -114,7 +119,8 @@ class RLBenchGym(SimEnv):
         Raises:
             DataError: the action is not eight finite numbers.
         """
-        checked = self._checked(action)
+        checked, joints = self._checked(action), self._last["agent_pos"][:_JOINTS]
+        checked[:_JOINTS] = np.clip(checked[:_JOINTS], joints - self._max_delta, joints + self._max_delta)
         try:
             observation, reward, terminated = self._task.step(checked)
         except self._invalid_action:

@@ -40,7 +40,7 @@ TASKS = {
 @EnvConfig.register_subclass("rlbench")
 @dataclass
 class RLBenchEnv(SimEnvConfig):
-    """RLBench's tasks as the paper uses them: four cameras, delta joint actions, sparse reward.
+    """RLBench's tasks as the paper uses them: four cameras, sparse reward; joint goals, also of policies of differences.
 
     Its demonstrations come from RLBench's dataset generator through `cqn-data convert` and `cqn-data delta`. It runs
     where RLBench, PyRep and CoppeliaSim are installed, one environment a process.
@@ -50,6 +50,7 @@ class RLBenchEnv(SimEnvConfig):
         fps: control steps a second, 20.
         variation: RLBench's variation of the task, 0 in the paper.
         episode_length: control steps before the episode is cut off; None: the paper's, 100 to 225.
+        max_delta: rad by which a joint's goal may lie from where it is, above 0 to 1; the authors clip at 0.2.
         obs_type: "pixels" (joints and cameras).
         cameras: which of front, wrist, left_shoulder, right_shoulder.
         The others are those of `SimEnvConfig`.
@@ -61,12 +62,14 @@ class RLBenchEnv(SimEnvConfig):
     gym_name = "cqn_rlbench/{task}-v0"
     tasks = TASKS
     known_cameras = CAMERAS
+    action_kind = "goals"
     rates = (20,)
     rates_are = "a step of RLBench's simulation is 0.05 s"
 
     task: str | None = "take_lid_off_saucepan"  # one of the paper's 20
     fps: int = 20  # RLBench's
     variation: int = 0  # of the task
+    max_delta: float = 0.2  # rad by which a joint's goal may lie from where it is
     obs_type: str = "pixels"  # the only one
     cameras: list[str] = field(default_factory=lambda: list(CAMERAS))  # front, wrist, shoulders
 
@@ -79,6 +82,8 @@ class RLBenchEnv(SimEnvConfig):
         super().check()
         if self.variation < 0:
             raise ConfigError(f"variation is {self.variation}: expected 0 or more.")
+        if not 0 < self.max_delta <= 1:
+            raise ConfigError(f"max_delta is {self.max_delta}: expected above 0 to 1 rad.")
 
     @property
     def sizes(self) -> Sizes:

@@ -34,6 +34,7 @@ class UR5eStationEnv(SimEnvConfig):
     gym_name = "cqn_station/{task}-v0"
     tasks = TASKS
     known_cameras = CAMERAS
+    action_kind = "differences"
     rates = (5, 10, 20, 25, 50)
     rates_are = "whole physics steps of 4 ms"
 
