@@ -40,7 +40,7 @@ TASKS = {
 @EnvConfig.register_subclass("rlbench")
 @dataclass
 class RLBenchEnv(SimEnvConfig):
-    """RLBench's tasks as the paper uses them: four cameras, sparse reward; joint goals, also of policies of differences.
+    """RLBench's tasks as the paper uses them: four cameras, sparse reward, joint goals, also for differences.
 
     Its demonstrations come from RLBench's dataset generator through `cqn-data convert` and `cqn-data delta`. It runs
     where RLBench, PyRep and CoppeliaSim are installed, one environment a process.
