@@ -295,9 +295,18 @@ def test_a_second_thought_right_before_the_stop_counts(demonstrations: list[str]
 def test_minutes_are_of_acting_and_learning_and_not_of_waiting(
     demonstrations: list[str], tmp_path: Path, clock: DrivenClock
 ) -> None:
+    shown: list[tuple[int, str]] = []
+
     def prepare(trainer: Trainer, hands: Hands) -> None:
-        session = hands.session
+        session, advance = hands.session, trainer.monitor.advance
         hands.during[0] = lambda: (session.apply(Event.PAUSE), hands.clock.sleep(1.0), session.apply(Event.RESUME))
+
+        def noted(done: int, note: str) -> None:
+            if note.startswith("step "):
+                shown.append((done, note))
+            advance(done, note)
+
+        trainer.monitor.advance = noted  # type: ignore[method-assign]
 
     arguments = [*ARM, *demonstrations, f"--output_dir={tmp_path / 'run'}", "--online_minutes=0.012"]
     began = clock.now
@@ -307,6 +316,8 @@ def test_minutes_are_of_acting_and_learning_and_not_of_waiting(
     assert trainer.counters.episodes >= 2
     assert trainer.env.waited_s >= 0.5  # of the pause, once it is noticed
     assert 0.72 <= trainer.counters.online_s <= passed - trainer.env.waited_s
+    assert len(shown) == trainer.counters.episodes
+    assert all(done <= 1 for done, _ in shown)  # seconds of 0.72, not steps of 30,000
     assert (tmp_path / "run/checkpoints/last/pretrained_model").is_dir()
 
 

@@ -108,7 +108,7 @@ class Trainer:
 
     def _online(self) -> None:
         c = self.counters
-        self.monitor.phase("online", self.config.steps, c.env_steps)
+        self.monitor.phase(*self._online_progress())
         while c.env_steps < self.config.steps and not self._out_of_time():
             before, number, began, waited = c.env_steps, c.episodes, self.clock.now, self.env.waited_s
             try:
@@ -198,7 +198,10 @@ class Trainer:
         self.metrics.write("episodes", row)
         self._recent = [*self._recent, outcome.success][-RECENT:]
         lately = f"success {sum(self._recent)}/{len(self._recent)} lately"
-        self.monitor.advance(c.env_steps, f"episode {c.episodes}  {lately}  Q {values.mean():+.2f}")
+        steps = f"step {c.env_steps}  " if self.config.online_minutes is not None else ""
+        self.monitor.advance(
+            self._online_progress()[2], f"{steps}episode {c.episodes}  {lately}  Q {values.mean():+.2f}"
+        )
 
     def _correct(self) -> None:
         """Learn from now on what a person says otherwise about finished episodes."""
@@ -215,6 +218,13 @@ class Trainer:
                 there = self.replay.correct(number, success=success, demo=demo)
             gone = "" if there else " It is not in the replay any more: nothing changes."
             self.monitor.message(f"Episode {number} is a {label} now.{gone}")
+
+    def _online_progress(self) -> tuple[str, int, int]:
+        """Name, total and done of the online phase, in what ends it: control steps, or seconds."""
+        minutes = self.config.online_minutes
+        if minutes is None:
+            return "online", self.config.steps, self.counters.env_steps
+        return "online, seconds", round(60 * minutes), int(self.counters.online_s)
 
     def _out_of_time(self) -> bool:
         minutes = self.config.online_minutes
