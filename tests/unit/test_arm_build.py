@@ -93,6 +93,13 @@ def test_what_is_given_replaces_what_was_seen(tmp_path: Path) -> None:
     assert (made.low[0], made.high[0]) == (-94, 92)
 
 
+@pytest.mark.parametrize("given", [[-100_000.0, 100_000.0], [-7.0, 5000.0], [-5000.0, 8.0]])
+def test_limits_far_beyond_what_was_demonstrated_are_refused(tmp_path: Path, given: list[float]) -> None:
+    settings = ArmSettings(joint_limits={"lift.pos": given})
+    with pytest.raises(ConfigError, match=r"--arm\.joint_limits of 'lift\.pos'.*Is it in another unit"):
+        limits_of(robot(), agent(tmp_path, DELTAS, deltas=True), settings, FPS, FPS)
+
+
 def test_joints_nobody_knows_are_named(tmp_path: Path) -> None:
     known = agent(tmp_path, DELTAS, deltas=True)
     for settings in (ArmSettings(joint_limits={"lft.pos": [0, 1]}), ArmSettings(home={"lft.pos": 1})):

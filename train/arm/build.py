@@ -41,6 +41,7 @@ __all__ = ["Operated", "make_operated", "recall", "steering"]
 Array = NDArray[np.float64]
 # Of a joint's range: the largest step where actions are goals, so that none says how far is usual.
 ABSOLUTE_SHARE = 0.05
+FAR_LIMIT = 10.0  # times the demonstrated range: degrees are 57 radians
 CURRENT_S = 0.3  # that a reading may be old, and no less than two control steps
 
 
@@ -191,8 +192,14 @@ def limits_of(robot: Robot, agent: Agent, settings: ArmSettings, fps: int, seen_
                 low[i], high[i] = min(low[i], seen[0]), max(high[i], seen[1])
             gripper = "gripper" in name
             step[i] = (high[i] - low[i]) * (1.0 if gripper else settings.step_factor * ABSOLUTE_SHARE)
-        margin = settings.joint_margin * (high[i] - low[i])
-        low[i], high[i] = settings.joint_limits.get(name, (low[i] - margin, high[i] + margin))
+        span, given = high[i] - low[i], settings.joint_limits.get(name)
+        if given is not None and span > 0 and max(low[i] - given[0], given[1] - high[i]) > FAR_LIMIT * span:
+            raise ConfigError(
+                f"--arm.joint_limits of '{name}' is {given}, the demonstrations' range {low[i]:.4g} to {high[i]:.4g}:"
+                f" it may reach {FAR_LIMIT:g} times that range beyond it at most. Is it in another unit?"
+            )
+        margin = settings.joint_margin * span
+        low[i], high[i] = given or (low[i] - margin, high[i] + margin)
     step *= min(1.0, seen_fps / fps)
     step = np.maximum(step, 1e-3 * np.maximum(high - low, 1e-6))  # a joint that never moved
     box = None
