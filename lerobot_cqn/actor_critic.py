@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .distributional import expectation, project_onto_support
+from .distributional import expectation, project_onto_support, two_hot
 from .losses import demo_mean
 from .model import Features, Model
 from .networks import initialise, projection
@@ -129,7 +129,8 @@ class DrQv2Model(Model):
             total = total + s.rl_loss_scale * (critic + actor)
             stats |= {"rl_loss": critic.detach(), "td_error": td_error, "actor_loss": actor.detach()}
         if s.bc_loss_scale > 0:
-            imitation = demo_mean((mean - batch.action).square().mean(-1), batch.demo)
+            squares = (mean - batch.action).square()
+            imitation = demo_mean(squares.sum(-1) if s.bc_sum else squares.mean(-1), batch.demo)
             stats["bc_action_loss"] = imitation.detach()
             total = total + s.bc_loss_scale * imitation
         stats["loss"] = total.detach()
@@ -153,10 +154,13 @@ class DrQv2Model(Model):
 
     @torch.no_grad()
     def td_target(self, next_features: Features, reward: Tensor, discount: Tensor) -> Tensor:
-        """Target [B, A]: that of the target critic with the lower value for a noisy next action."""
+        """Target [B, A]: value or distribution of the target critic with the lower value for a noisy next action."""
         with self.autocast():
             logits: Tensor = self.target_critic(next_features, self._noisy(self.actor(next_features)))
-        lower = self.q_values(logits).argmin(1)
+        q = self.q_values(logits)  # [B, 2]
+        if self.settings.distributional and self.settings.two_hot_target:
+            return two_hot((reward + discount * q.amin(1, keepdim=True))[:, 0], self.support)
+        lower = q.argmin(1)
         logits = logits[torch.arange(len(logits), device=logits.device), lower]  # [B, A]
         if not self.settings.distributional:
             return reward + discount * logits

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-__all__ = ["expectation", "project_onto_support", "support"]
+__all__ = ["expectation", "project_onto_support", "support", "two_hot"]
 
 
 def support(v_min: float, v_max: float, atoms: int, device: torch.device | str | None = None) -> Tensor:
@@ -30,3 +30,13 @@ def project_onto_support(probs: Tensor, reward: Tensor, discount: Tensor, values
     weight = (1 - (position[:, None, :] - torch.arange(atoms, device=values.device)[:, None]).abs()).clamp_(0)
     middle = probs.flatten(1, -2)  # [B, M, A]
     return torch.bmm(middle, weight.transpose(1, 2)).view_as(probs)
+
+
+def two_hot(value: Tensor, values: Tensor) -> Tensor:
+    """Distribution on the two atoms next to a value, whose expectation it is: [B], [A] -> [B, A]; cut at the ends.
+
+    values: [A], equally spaced.
+    """
+    step = (values[-1] - values[0]) / (values.shape[0] - 1)
+    position = (value.clamp(values[0], values[-1]) - values[0]) / step
+    return (1 - (position[:, None] - torch.arange(values.shape[0], device=values.device)).abs()).clamp(0)

@@ -105,7 +105,10 @@ class DrQv2Settings(CommonSettings):
     """
 
     atoms: int = number(101, least=2)
+    hidden_dim: int = number(1024, least=1)  # the authors' code; the paper gives no number
     rl_loss_scale: float = number(1.0, least=0)
+    bc_sum: bool = True  # imitation sums over dimensions, as the authors' code; False: their mean
+    two_hot_target: bool = True  # target of the lower scalar as two atoms, as the authors' code; False: a projection
     lr: float = number(1e-4, above=0)
     tau: float = number(0.01, above=0, most=1)
     noise_clip: float = number(0.3, least=0)  # of the noise on actions inside the losses (Yarats et al. 2022)
@@ -136,14 +139,21 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
+_DRQV2: dict[str, Any] = {"distributional": False, "exploration_noise": 0.2, "weight_decay": 0.0}
+_REAL_WORLD: dict[str, Any] = {"frame_stack": 4, "brightness": 0.2, "contrast": 0.2}
+_MEANS: dict[str, Any] = {"bc_sum": False, "two_hot_target": False}
 DRQV2_PRESETS: dict[str, dict[str, Any]] = {
-    # Last table of the paper's appendix.
+    # Last table of the paper's appendix, RLBench and the real arm.
     "drqv2_plus": {},
-    "drqv2": {"distributional": False, "exploration_noise": 0.2, "weight_decay": 0.0},
+    "drqv2": _DRQV2,
+    "drqv2_plus_real_world": _REAL_WORLD,
+    "drqv2_real_world": {**_DRQV2, **_REAL_WORLD},
     # Ours: DrQ-v2+ at the sizes and learning rates of CQN's presets of the same names.
-    "laptop_state": {"frame_stack": 1, "hidden_dim": 256, "lr": 3e-4},
-    "laptop_pixels": {"frame_stack": 2, "encoder_channels": (16, 32, 64, 64), "hidden_dim": 256, "lr": 1e-4},
-}
+    "laptop_state": {"frame_stack": 1, "hidden_dim": 256, "lr": 3e-4, **_MEANS},
+    "laptop_pixels": {
+        "frame_stack": 2, "encoder_channels": (16, 32, 64, 64), "hidden_dim": 256, "lr": 1e-4, **_MEANS,
+    },
+}  # fmt: skip
 
 
 def resolve[S: CommonSettings](

@@ -65,6 +65,8 @@ PRESETS: dict[str, dict[str, str]] = {
     "drqv2": {
         "drqv2_plus": "the paper's DrQ-v2+: distributional critic, learns from demonstrations (default)",
         "drqv2": "DrQ-v2 as published; demonstrations are experience like any other",
+        "drqv2_plus_real_world": "DrQ-v2+ in the paper's setting of a real arm",
+        "drqv2_real_world": "DrQ-v2 in the paper's setting of a real arm",
         "laptop_state": "ours: DrQ-v2+ at the sizes of CQN's laptop_state",
         "laptop_pixels": "ours: DrQ-v2+ at the sizes of CQN's laptop_pixels",
     },

@@ -48,6 +48,10 @@ _RECIPES: dict[str, Recipe] = {
     "laptop_pixels": Recipe(updates_per_step=0, updates_per_episode=25, batch_size=64, demo_batch_size=64),
     "practice_state": Recipe(updates_per_step=0, updates_per_episode=25, batch_size=64, demo_batch_size=64),
     "drqv2": Recipe(batch_size=512, demo_batch_size=0, relabel=False, action_bounds="environment"),
+    "drqv2_plus_real_world": Recipe(updates_per_step=0, updates_per_episode=50),
+    "drqv2_real_world": Recipe(
+        updates_per_step=0, updates_per_episode=50, batch_size=512, demo_batch_size=0, relabel=False
+    ),
 }
 
 

@@ -98,7 +98,12 @@ class Plain:
             lower = min(following, key=lambda out: float(self.value(out)))
             for out in self.critics(self.model.critic, batch.observation, i, batch.action[i].double()):
                 if self.s.distributional:
-                    target = self.projected(lower.softmax(0), reward, discount)
+                    sure = reward + discount * float(self.value(lower))
+                    target = (
+                        self.projected(torch.ones(1, dtype=torch.float64), sure, 0.0, [0.0])
+                        if self.s.two_hot_target
+                        else self.projected(lower.softmax(0), reward, discount, self.support)
+                    )
                     critic -= float(target @ out.log_softmax(0))
                     wanted = sum(float(p) * z for p, z in zip(target, self.support, strict=True))
                 else:
@@ -109,16 +114,17 @@ class Plain:
             values = self.critics(self.model.critic, batch.observation, i, mean)
             actor -= min(float(self.value(out)) for out in values)
             if batch.demo[i]:
-                imitation += sum(float((mean[d] - batch.action[i, d]) ** 2) for d in range(DIMS)) / DIMS
+                squares = sum(float((mean[d] - batch.action[i, d]) ** 2) for d in range(DIMS))
+                imitation += squares if self.s.bc_sum else squares / DIMS
         return {
             "rl_loss": critic / SIZE, "td_error": td_error / SIZE, "actor_loss": actor / SIZE,
             "bc_action_loss": imitation / max(demos, 1),
         }  # fmt: skip
 
-    def projected(self, probs: Tensor, reward: float, discount: float) -> Tensor:
+    def projected(self, probs: Tensor, reward: float, discount: float, atoms: Any) -> Tensor:
         step = self.support[1] - self.support[0]
         target = torch.zeros(self.s.atoms, dtype=torch.float64)
-        for p, z in zip(probs.tolist(), self.support, strict=True):
+        for p, z in zip(probs.tolist(), atoms, strict=True):
             where = (min(max(reward + discount * z, self.s.v_min), self.s.v_max) - self.s.v_min) / step
             below = min(int(where + 1e-9), self.s.atoms - 1)
             target[below] += p * (1 - (where - below))
@@ -130,8 +136,9 @@ class Plain:
 @pytest.mark.parametrize("distributional", [True, False])
 @pytest.mark.parametrize(("views", "low_dim"), [(0, P), (1, 0), (2, P)])
 @pytest.mark.parametrize("demo", ["some", "none"])
-def test_losses(views: int, low_dim: int, distributional: bool, demo: str) -> None:
-    model = build(views, low_dim, distributional=distributional)
+@pytest.mark.parametrize("as_authors", [True, False])
+def test_losses(views: int, low_dim: int, distributional: bool, demo: str, as_authors: bool) -> None:
+    model = build(views, low_dim, distributional=distributional, bc_sum=as_authors, two_hot_target=as_authors)
     batch = random_batch(views, low_dim, demo)
     loss, stats = model.loss(batch)
     expected = Plain(model).loss(batch)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from lerobot_cqn.critic import CQNModel
-from lerobot_cqn.distributional import expectation, project_onto_support, support
+from lerobot_cqn.distributional import expectation, project_onto_support, support, two_hot
 from lerobot_cqn.settings import CQNSettings
 from tests.oracle import Oracle
 
@@ -83,3 +83,14 @@ def test_identity() -> None:
     assert torch.allclose(
         project_onto_support(probs, column(0, 0, 0), column(1, 1, 1), support(-1, 1, 51)), probs, atol=1e-5
     )
+
+
+@given(value=st.floats(-3, 3), low=st.floats(-2, 0), span=st.floats(0.5, 4), atoms=st.integers(2, 101))
+def test_two_hot_is_the_value_on_two_neighbours(value: float, low: float, span: float, atoms: int) -> None:
+    values = support(low, low + span, atoms).double()
+    probs = two_hot(torch.tensor([value], dtype=torch.float64), values)[0]
+    assert float(probs.sum()) == pytest.approx(1.0)
+    assert float(expectation(probs, values)) == pytest.approx(min(max(value, low), low + span), abs=1e-5)
+    places = torch.nonzero(probs > 1e-9).flatten()
+    assert len(places) <= 2
+    assert int(places[-1] - places[0]) <= 1
