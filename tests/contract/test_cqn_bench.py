@@ -93,7 +93,7 @@ def test_wrong_arguments_of_a_method_are_found_before_any_run(
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("methods: {a: [--x=1]}\ntasks: {t: [--y=1]}\nseeds: []", "seeds as a list of whole numbers"),
+        ("methods: {a: [--x=1]}\ntasks: {t: [--y=1]}\nseeds: []", "seeds as a list of different whole numbers"),
         ("methods: {a: --x}\ntasks: {t: [--y=1]}\nseeds: [1]", "expected methods as NAME"),
         ("methods: {a: [--x=1]}\nseeds: [1]", "expected tasks as NAME"),
         ("method: {a: []}", "Did you mean 'methods'?"),
