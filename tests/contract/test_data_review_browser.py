@@ -18,6 +18,7 @@ from cqn_data.review.app import Review, make_app  # noqa: E402
 from cqn_data.review.recording import Recording  # noqa: E402
 from cqn_data.web.server import PageServer  # noqa: E402
 
+from .columns import ACTION, STATE, TOP, grey, moving, write_columns  # noqa: E402
 from .data_recording import LENGTHS  # noqa: E402
 
 CHROMIUM = Path("/usr/bin/chromium")
@@ -183,3 +184,21 @@ def test_the_page_fits_the_screen(visit: Callable[..., Any], size: dict[str, int
         assert box["y"] >= 0
         assert box["y"] + box["height"] <= size["height"]
         assert box["height"] >= 44
+
+
+def test_pictures_that_are_no_film_are_shown_one_by_one(browser: Any, tmp_path: Path) -> None:
+    root = write_columns(tmp_path / "src", [{STATE: moving(12), ACTION: moving(12), TOP: grey(12)}], stills=True)
+    opened = Recording(open_source("local/src", str(root)))
+    desk = Desk(tmp_path / "seen.yaml", "local/src", opened.lengths, opened.recorded, None)
+    review = Review(opened, desk, "local/src", str(root))
+    with PageServer(lambda token: make_app(review, token), "review page") as server:
+        page = browser.new_page(viewport=DESK)
+        page.goto(server.url)
+        page.wait_for_selector("body[data-ready=true]")
+        shown = page.locator("#films img")
+        until(lambda: shown.evaluate("picture => picture.naturalWidth") == 48)
+        page.keyboard.press("ArrowRight")
+        until(lambda: "first=1&" in shown.get_attribute("src"))
+        page.keyboard.press("Space")
+        until(lambda: page.locator("#place").inner_text().startswith("step 11 "))
+        page.close()
