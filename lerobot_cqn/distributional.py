@@ -22,12 +22,7 @@ def project_onto_support(probs: Tensor, reward: Tensor, discount: Tensor, values
     probs: [B, ..., A] distribution of Z over `values`; reward, discount: [B, 1]; values: [A], equally spaced.
     Returns [B, ..., A]. Atoms beyond the support are moved to its ends.
     """
-    v_min, v_max = values[0], values[-1]
-    atoms = values.shape[0]
-    shifted = (reward + discount * values).clamp(v_min, v_max)  # [B, A]
-    position = (shifted - v_min) / ((v_max - v_min) / (atoms - 1))
-    # Share of old atom j that lands on new atom i: a triangle of width one around each atom. [B, A, A]
-    weight = (1 - (position[:, None, :] - torch.arange(atoms, device=values.device)[:, None]).abs()).clamp_(0)
+    weight = _placed(reward + discount * values, values)  # [B, A, A]
     middle = probs.flatten(1, -2)  # [B, M, A]
     return torch.bmm(middle, weight.transpose(1, 2)).view_as(probs)
 
@@ -37,6 +32,12 @@ def two_hot(value: Tensor, values: Tensor) -> Tensor:
 
     values: [A], equally spaced.
     """
-    step = (values[-1] - values[0]) / (values.shape[0] - 1)
-    position = (value.clamp(values[0], values[-1]) - values[0]) / step
-    return (1 - (position[:, None] - torch.arange(values.shape[0], device=values.device)).abs()).clamp(0)
+    return _placed(value[:, None], values)[..., 0]
+
+
+def _placed(points: Tensor, values: Tensor) -> Tensor:
+    """Share of each of K points that lands on each atom, a triangle of width one around it: [B, K] -> [B, A, K]."""
+    v_min, v_max = values[0], values[-1]
+    atoms = values.shape[0]
+    position = (points.clamp(v_min, v_max) - v_min) / ((v_max - v_min) / (atoms - 1))
+    return (1 - (position[:, None, :] - torch.arange(atoms, device=values.device)[:, None]).abs()).clamp_(0)

@@ -6,7 +6,7 @@ the policy bring one to the other, in every command of LeRobot: one remembers th
 them, or takes them off goals.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -97,9 +97,8 @@ class RememberJointsProcessorStep(RelativeActionsProcessorStep):
         return {}
 
 
-@ProcessorStepRegistry.register(name="cqn_delta_to_goal")
-class DeltaToGoalProcessorStep(AbsoluteActionsProcessorStep):
-    """Turns an action [K, D] into the absolute goal [K, D] by the joints that its partner remembers.
+class _JointsStep(AbsoluteActionsProcessorStep):
+    """What both ways have: the joints that a partner remembers, and the goals that were sent.
 
     For kind "command_steps" it remembers the last goal, which starts from the measured joints. A control step begins
     with a new frame; asking again in the same one gives the same answer.
@@ -124,17 +123,6 @@ class DeltaToGoalProcessorStep(AbsoluteActionsProcessorStep):
         self._frame = -1
         self._before: Tensor | None = None  # the goal that this step's is a difference from
         self._goal: Tensor | None = None  # this step's own
-
-    def __call__(self, transition: EnvTransition) -> EnvTransition:
-        """Goal of the action. Raises DataError when no state was seen in this episode."""
-        action = transition.get(TransitionKey.ACTION)
-        if not isinstance(action, Tensor):
-            return transition
-        state, before = self._remembered(action)
-        self._goal = goal_of(action, state, before, self.deltas)
-        changed = transition.copy()
-        changed[TransitionKey.ACTION] = self._goal.clone()
-        return changed
 
     def sent(self, goal: Tensor | None) -> None:
         """The goal [K, D] that was really sent in this step; None: none was, and the next starts from the joints."""
@@ -170,9 +158,25 @@ class DeltaToGoalProcessorStep(AbsoluteActionsProcessorStep):
         return state, self._before
 
 
+@ProcessorStepRegistry.register(name="cqn_delta_to_goal")
+class DeltaToGoalProcessorStep(_JointsStep):
+    """Turns an action [K, D] into the absolute goal [K, D]."""
+
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        """Goal of the action. Raises DataError when no state was seen in this episode."""
+        action = transition.get(TransitionKey.ACTION)
+        if not isinstance(action, Tensor):
+            return transition
+        state, before = self._remembered(action)
+        self._goal = goal_of(action, state, before, self.deltas)
+        changed = transition.copy()
+        changed[TransitionKey.ACTION] = self._goal.clone()
+        return changed
+
+
 @ProcessorStepRegistry.register(name="cqn_goal_to_delta")
-class GoalToDeltaProcessorStep(DeltaToGoalProcessorStep):
-    """Turns a goal [K, D] into the differences [K, D] that an environment takes; otherwise as its base."""
+class GoalToDeltaProcessorStep(_JointsStep):
+    """Turns a goal [K, D] into the differences [K, D] that an environment takes."""
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Action that asks for the goal. Raises DataError when no state was seen in this episode."""
@@ -185,15 +189,11 @@ class GoalToDeltaProcessorStep(DeltaToGoalProcessorStep):
         return changed
 
 
-def recorded_deltas(dataset_meta: Any) -> Any:
-    """Description of the differences that the environment of the demonstrations takes; None: goals, or not known.
-
-    dataset_meta: as of `converted_deltas`.
-    """
-    if dataset_meta is None:
-        return None
-    entries = read_history(Path(dataset_meta.root))
-    return next((e["deltas"] for e in entries if e.get("operation") == "record" and e.get("deltas")), None)
+def recorded_deltas(history: Sequence[Mapping[str, Any]]) -> Any:
+    """Description of the differences that were recorded, and that the environment takes; None: goals, or not known."""
+    return next(
+        (entry["deltas"] for entry in history if entry.get("operation") == "record" and entry.get("deltas")), None
+    )
 
 
 def undone_deltas(dataset_meta: Any) -> DeltaJoints | None:
@@ -202,18 +202,19 @@ def undone_deltas(dataset_meta: Any) -> DeltaJoints | None:
     dataset_meta: as of `converted_deltas`.
     Raises DataError as it does, and where the goals were made differences of another kind.
     """
-    recorded = recorded_deltas(dataset_meta)
-    if recorded is None:
+    if dataset_meta is None:
         return None
-    now = current_description(read_history(Path(dataset_meta.root)))
-    if now == recorded:
+    root = Path(dataset_meta.root)
+    history = read_history(root)
+    recorded, now = recorded_deltas(history), current_description(history)
+    if recorded is None or now == recorded:
         return None
     if now is not None:
         raise DataError(
-            f"{dataset_meta.root}: the environment takes differences of kind '{recorded['kind']}', the dataset now has"
+            f"{root}: the environment takes differences of kind '{recorded['kind']}', the dataset now has"
             f" '{now['kind']}', which cannot be driven there: make the actions absolute, or use the first recording."
         )
-    return parse(recorded, dataset_meta.features, Path(dataset_meta.root))
+    return parse(recorded, dataset_meta.features, root)
 
 
 def converted_deltas(dataset_meta: Any) -> DeltaJoints | None:
@@ -226,7 +227,6 @@ def converted_deltas(dataset_meta: Any) -> DeltaJoints | None:
         return None
     root = Path(dataset_meta.root)
     history = read_history(root)
-    # Differences that were recorded are what the environment itself takes.
-    recorded = [entry.get("deltas") for entry in history if entry.get("operation") == "record"]
     now = current_description(history)
-    return None if now is None or now in recorded else parse(now, dataset_meta.features, root)
+    # Differences that were recorded are what the environment itself takes.
+    return None if now is None or now == recorded_deltas(history) else parse(now, dataset_meta.features, root)

@@ -77,7 +77,7 @@ class Agent:
 
     @property
     def _goal_steps(self) -> list[DeltaToGoalProcessorStep]:
-        return [step for step in self.postprocessor.steps if type(step) is DeltaToGoalProcessorStep]
+        return [step for step in self.postprocessor.steps if isinstance(step, DeltaToGoalProcessorStep)]
 
     def act(self, prepared: Frame, *, explore: bool) -> tuple[torch.Tensor, NDArray[Any]]:
         """Normalised actions [K, D] in [-1, 1] for K rows, and the mean Q [K] of each."""

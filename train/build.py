@@ -16,7 +16,7 @@ from lerobot.robots.config import RobotConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_cqn.errors import ConfigError, OutputExistsError
-from lerobot_cqn.joint_goals import converted_deltas
+from lerobot_cqn.joint_goals import converted_deltas, recorded_deltas
 from lerobot_cqn.learner import Learner
 from lerobot_cqn.schema import read_history
 
@@ -236,7 +236,7 @@ def check_actions(run: ValidRun, meta: Any) -> None:
     origin = next((entry for entry in entries if entry.get("operation") in ("record", "convert")), None)
     if not takes or origin is None:
         return
-    recorded = "differences" if origin["operation"] == "record" and origin.get("deltas") else "goals"
+    recorded = "goals" if recorded_deltas(entries) is None else "differences"
     if recorded != takes:
         raise ConfigError(
             f"The demonstrations' actions were recorded as {recorded}, and --env.type={run.acts_in.type} takes {takes}:"

@@ -54,8 +54,8 @@ def rewrite(view: View, source: Source, root: Path, bar: Progress) -> None:
     _refuse_cut_videos(source)
     with new_folder(root) as folder:
         _copy_rest(source.root, folder, bar)
-        stats, places = _write_numbers(view, source, folder, bar)
         numbers = _task_numbers(view, source)
+        stats, places = _write_numbers(view, source, folder, bar, numbers)
         _write_episodes(view, source, folder, stats, places)
         pd.DataFrame({"task_index": range(len(numbers))}, index=pd.Index(numbers, name="task")).to_parquet(
             folder / "meta/tasks.parquet"
@@ -103,7 +103,9 @@ def _copy_rest(source: Path, folder: Path, bar: Progress) -> None:
         shutil.copyfile(path, copy)
 
 
-def _write_numbers(view: View, source: Source, folder: Path, bar: Progress) -> tuple[dict[int, Stats], Places]:
+def _write_numbers(
+    view: View, source: Source, folder: Path, bar: Progress, task_numbers: dict[str, int]
+) -> tuple[dict[int, Stats], Places]:
     """The data files, in the source's own partition where that is in order.
 
     Returns:
@@ -112,7 +114,6 @@ def _write_numbers(view: View, source: Source, folder: Path, bar: Progress) -> t
     features = {**source.meta.features, **all_features(view)}
     schema = get_hf_features_from_features(features)
     numbers = {k: f for k, f in all_features(view).items() if f["dtype"] not in NOT_NUMBERS}
-    tasks = _task_numbers(view, source)
     stats: dict[int, Stats] = {}
     places: Places = {}
     written = 0
@@ -140,7 +141,7 @@ def _write_numbers(view: View, source: Source, folder: Path, bar: Progress) -> t
         new = {k: table[k] for k in numbers} | {
             "timestamp": pa.array(times, pa.float32()),
             "index": pa.array(range(written, written + len(times)), pa.int64()),
-            "task_index": pa.array([tasks[t] for i in episodes for t in view.episode(i).tasks], pa.int64()),
+            "task_index": pa.array([task_numbers[t] for i in episodes for t in view.episode(i).tasks], pa.int64()),
         }
         arrays = [new[k] if k in new else old[k] for k in schema]
         written += len(times)

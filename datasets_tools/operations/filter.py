@@ -103,7 +103,7 @@ Delta actions are formed anew, so that they connect the states that are left.
 
         rule, why = self.rule(view)
         known_episodes(view, self.episode_thresholds)
-        rules = {index: self.rule_of(view, index, rule) for index in self.episode_thresholds}
+        rules = {index: self.rule_with(view, rule, own) for index, own in self.episode_thresholds.items()}
         after, reports = filtered_view(view, rule, self.min_steps, skip=self.skip_short, rules=rules)
         _show(reports)
         self._advise(view, reports)
@@ -135,14 +135,11 @@ Delta actions are formed anew, so that they connect the states that are left.
             f" nothing moves: below {shown(settings['threshold'])} a step.{why}{short}"
         )
 
-    def rule_of(self, view: "View", index: int, rule: "Rule") -> "Rule":
-        """The rule for one episode: with its own threshold in place of the common one."""
-        if index not in self.episode_thresholds:
-            return rule
-        names, own = dimension_names(view.features[STATE]), self.episode_thresholds[index]
-        return dataclasses.replace(
-            rule, thresholds=tuple(self.joint_thresholds.get(names[i], own) for i in rule.joints)
-        )
+    def rule_with(self, view: "View", rule: "Rule", own: float) -> "Rule":
+        """The rule with another threshold in place of the common one; joints with one of their own keep it."""
+        names = dimension_names(view.features[STATE])
+        thresholds = tuple(self.joint_thresholds.get(names[i], own) for i in rule.joints)
+        return dataclasses.replace(rule, thresholds=thresholds)
 
     def rule(self, view: "View") -> "tuple[Rule, dict[str, Any]]":
         """Rule of what a pause is in this dataset, and reasons for an automatic threshold; says what it goes by."""

@@ -15,7 +15,7 @@ from .parts import known_episodes
 if TYPE_CHECKING:
     from ..views.view import DerivedView, View
 
-__all__ = ["Task"]
+__all__ = ["MAX_LENGTH", "Task"]
 
 MAX_LENGTH = 500  # characters
 

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_cqn.errors import ConfigError, CQNError, DataError, OutputError
+from lerobot_cqn.errors import ConfigError, CQNError
 
 from ..disk.folders import local_root, refuse_existing, refuse_inside
+from ..operations.task import MAX_LENGTH
 from ..web.access import Guard
 from ..web.routes import NonsenseError, add_errors, add_files, body, error
 from .decided import Desk
@@ -47,7 +48,7 @@ class Review:
     def state(self) -> dict[str, Any]:
         """All that changes."""
         decided, errand = self.desk.decided, self.errand
-        looked = {i: self.recording.look(i, decided) for i in self.recording.recorded}
+        looked = self.recording.look_at(self.recording.recorded, decided)
         left = [i for i in looked if not decided.of(i).drop]
         return {
             **decided.as_json(),
@@ -77,7 +78,7 @@ def make_app(review: Review, token: str, host: str = "127.0.0.1") -> "FastAPI":
     from fastapi import FastAPI
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None, redirect_slashes=False)
-    add_errors(app, {ConfigError: 409, DataError: 409, OutputError: 409, CQNError: 409})
+    add_errors(app, {CQNError: 409})
     _add_decisions(app, review)
     _add_looks(app, review)
     public = add_files(app, Path(__file__).parent / "static")
@@ -113,7 +114,7 @@ def _add_decisions(app: "FastAPI", review: Review) -> None:
         if changes.get("threshold") is not None:
             changes["threshold"] = _threshold(changes["threshold"], least=0.0)
         if changes.get("task") is not None:
-            changes["task"] = " ".join(changes["task"].split())[:500] or None
+            changes["task"] = " ".join(changes["task"].split())[:MAX_LENGTH] or None
         return await after(review.desk.change, index, **changes)
 
     @app.post("/api/threshold")
@@ -151,7 +152,7 @@ def _add_looks(app: "FastAPI", review: Review) -> None:
     @app.get("/api/pauses/{index}")
     def _(index: int, threshold: float | None = None) -> JSONResponse:
         moved = None if threshold is None else _threshold(threshold, least=1e-9)
-        looked = recording.look(_episode(review, index), review.desk.decided, moved)
+        looked = recording.look_at([_episode(review, index)], review.desk.decided, moved)[index]
         return JSONResponse({"start": looked.start, "stop": looked.stop, "runs": looked.runs, "kept": looked.kept})
 
     @app.get("/api/film/{index}/{key:path}")

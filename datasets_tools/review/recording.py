@@ -4,6 +4,7 @@ Shapes: T steps of an episode, S state dimensions.
 """
 
 import threading
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -111,30 +112,32 @@ class Recording:
         curves = [[float(f"{v:.{NEAREST}g}") for v in row] for row in shown]
         return {"every": every, "states": curves, "films": films}
 
-    def look(self, index: int, decided: Decided, threshold: float | None = None) -> Looked:
-        """What becomes of an episode by the decisions; `threshold` in place of the common one, while it is moved."""
-        decision = decided.of(index)
+    def look_at(self, indices: Iterable[int], decided: Decided, threshold: float | None = None) -> dict[int, Looked]:
+        """What becomes of episodes by the decisions; `threshold` in place of the common one, while it is moved."""
         common = decided.threshold if threshold is None else threshold
-        own = common if decision.threshold is None else decision.threshold
-        start, stop = decision.head, self.lengths[index] - decision.tail
-        if common is None or own is None or self.suggestion is None:
-            return Looked(start, stop, ())
+        if common is None or self.suggestion is None:
+            return {i: Looked(*self._ends(decided, i), ()) for i in indices}
         with self._lock:
-            rule = self._rule(decided, common, own)
-            rates = (rule.limits_state, rule.limits_action)
+            # As the recipe's filter has it: after what is dropped and cut off, which decides how fast is driving.
+            left = [i for i in self.recorded if not decided.of(i).drop]
+            view = Selected(self.source, rows={i: np.arange(*self._ends(decided, i), dtype=np.int64) for i in left})
+            setting = Filter(threshold=common)
+            rule = setting.rule_at(view, common)
             relabelled = any("label" in step for step in decided.recipe(self.recorded))
-            key = (index, start, stop, common, own, rates, relabelled)
-            if key not in self._looked:
-                self._looked[key] = self._decide(index, start, stop, rule, relabelled=relabelled)
-            return self._looked[key]
+            looked = {}
+            for index in indices:
+                own = decided.of(index).threshold
+                ends, one = self._ends(decided, index), rule if own is None else setting.rule_with(view, rule, own)
+                key = (index, ends, one, relabelled)
+                if key not in self._looked:
+                    self._looked[key] = self._decide(index, *ends, one, relabelled=relabelled)
+                looked[index] = self._looked[key]
+            return looked
 
-    def _rule(self, decided: Decided, common: float, own: float) -> Rule:
-        """As the recipe's filter has it: after what is dropped and cut off, which decides how fast is driving."""
-        left = [i for i in self.recorded if not decided.of(i).drop]
-        rows: dict[int, NDArray[np.int64]]
-        rows = {i: np.arange(decided.of(i).head, self.lengths[i] - decided.of(i).tail, dtype=np.int64) for i in left}
-        view, setting = Selected(self.source, rows=rows), Filter(threshold=common, episode_thresholds={-1: own})
-        return setting.rule_of(view, -1, setting.rule_at(view, common))
+    def _ends(self, decided: Decided, index: int) -> tuple[int, int]:
+        """Steps from and to which an episode stays."""
+        decision = decided.of(index)
+        return decision.head, self.lengths[index] - decision.tail
 
     def _decide(self, index: int, start: int, stop: int, rule: Rule, *, relabelled: bool) -> Looked:
         episode = self.source.episode(index)

@@ -9,33 +9,17 @@ import pytest
 import yaml
 
 from cqn_data.disk.source import open_source
+from cqn_data.review.app import Review, make_app
 from cqn_data.review.decided import Desk
+from cqn_data.review.recording import Recording
+from cqn_data.web.server import PageServer
 
-pytest.importorskip("fastapi", reason="needs the extra [page]")
-playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra [dev]")
+from .browsing import IN_A_BROWSER, WAIT_MS, browser_fixture  # noqa: F401  # skips where there is no browser
+from .columns import ACTION, STATE, TOP, grey, moving, write_columns
+from .data_recording import LENGTHS
 
-from cqn_data.review.app import Review, make_app  # noqa: E402
-from cqn_data.review.recording import Recording  # noqa: E402
-from cqn_data.web.server import PageServer  # noqa: E402
-
-from .columns import ACTION, STATE, TOP, grey, moving, write_columns  # noqa: E402
-from .data_recording import LENGTHS  # noqa: E402
-
-CHROMIUM = Path("/usr/bin/chromium")
-pytestmark = [
-    pytest.mark.skipif(not CHROMIUM.exists(), reason=f"needs a browser at {CHROMIUM}"),
-    pytest.mark.real_time(reason="a browser shows and sends in its own time"),
-]
-WAIT_MS = 60_000
+pytestmark = IN_A_BROWSER
 DESK, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as run:
-        browser = run.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

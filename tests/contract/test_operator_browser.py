@@ -3,40 +3,24 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from cqn_train.operator.board import Board
+from cqn_train.operator.page.server import OperatorServer
 from cqn_train.operator.session import Event, Label, Session, State
 
-pytest.importorskip("fastapi", reason="needs the extra [page]")
-playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra [dev]")
+from .browsing import IN_A_BROWSER, WAIT_MS, browser_fixture  # noqa: F401  # skips where there is no browser
 
-from cqn_train.operator.page.server import OperatorServer  # noqa: E402
-
-CHROMIUM = Path("/usr/bin/chromium")
-pytestmark = [
-    pytest.mark.skipif(not CHROMIUM.exists(), reason=f"needs a browser at {CHROMIUM}"),
-    pytest.mark.real_time(reason="a browser shows and sends in its own time"),
-]
-WAIT_MS = 60_000
+pytestmark = IN_A_BROWSER
 PHONE = {"width": 375, "height": 812}
 NAMES = {
     "start": "Start", "pause": "Pause", "resume": "Resume", "success": "Success", "failure": "Failure",
     "discard": "Discard", "take_over": "Take over", "hand_back": "Hand back", "home": "Home", "free": "By hand",
     "ready": "Ready", "stop": "Stop run",
 }  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as run:
-        browser = run.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture
