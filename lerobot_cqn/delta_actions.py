@@ -12,7 +12,16 @@ from typing import Any, Literal, get_args
 from .errors import DataError, one_of
 from .schema import ACTION, HISTORY, STATE, dimension_names
 
-__all__ = ["KINDS", "DeltaJoints", "Kind", "current_description", "description", "parse"]
+__all__ = [
+    "KINDS",
+    "DeltaJoints",
+    "Kind",
+    "current_description",
+    "description",
+    "origin_of",
+    "parse",
+    "recorded_deltas",
+]
 
 Kind = Literal["command", "command_steps", "state"]
 KINDS: tuple[str, ...] = get_args(Kind)
@@ -60,6 +69,22 @@ def description(deltas: DeltaJoints, features: Features) -> dict[str, Any]:
 def current_description(history: Sequence[Mapping[str, Any]]) -> Any:
     """The newest description of the actions in a history; None where they are absolute, or nothing is said of them."""
     return next((entry["deltas"] for entry in reversed(history) if "deltas" in entry), None) or None
+
+
+def origin_of(history: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+    """The entry of a history that says how the actions came about, through merges; None where none does."""
+    for entry in history:
+        if entry.get("operation") in ("record", "convert"):
+            return entry
+        if entry.get("operation") == "merge":
+            return origin_of(entry["sources"][0]["history"])
+    return None
+
+
+def recorded_deltas(history: Sequence[Mapping[str, Any]]) -> Any:
+    """Description of the differences that were recorded, and that the environment takes; None: goals, or not known."""
+    origin = origin_of(history)
+    return origin.get("deltas") or None if origin is not None and origin["operation"] == "record" else None
 
 
 def parse(described: Any, features: Features, root: Path) -> DeltaJoints:

@@ -6,7 +6,7 @@ the policy bring one to the other, in every command of LeRobot: one remembers th
 them, or takes them off goals.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from lerobot.processor import (
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from .delta_actions import DeltaJoints, Kind, current_description, parse
+from .delta_actions import DeltaJoints, Kind, current_description, parse, recorded_deltas
 from .errors import DataError
 from .schema import read_history
 
@@ -32,7 +32,6 @@ __all__ = [
     "action_of",
     "converted_deltas",
     "goal_of",
-    "recorded_deltas",
     "undone_deltas",
 ]
 
@@ -187,13 +186,6 @@ class GoalToDeltaProcessorStep(_JointsStep):
         changed[TransitionKey.ACTION] = self.action_of(goal)
         self._goal = goal.detach().clone()
         return changed
-
-
-def recorded_deltas(history: Sequence[Mapping[str, Any]]) -> Any:
-    """Description of the differences that were recorded, and that the environment takes; None: goals, or not known."""
-    return next(
-        (entry["deltas"] for entry in history if entry.get("operation") == "record" and entry.get("deltas")), None
-    )
 
 
 def undone_deltas(dataset_meta: Any) -> DeltaJoints | None:

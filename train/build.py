@@ -15,8 +15,9 @@ from lerobot.policies.factory import get_policy_class, make_policy, make_pre_pos
 from lerobot.robots.config import RobotConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
 
+from lerobot_cqn.delta_actions import origin_of, recorded_deltas
 from lerobot_cqn.errors import ConfigError, OutputExistsError
-from lerobot_cqn.joint_goals import converted_deltas, recorded_deltas
+from lerobot_cqn.joint_goals import converted_deltas
 from lerobot_cqn.learner import Learner
 from lerobot_cqn.schema import read_history
 
@@ -233,8 +234,7 @@ def check_actions(run: ValidRun, meta: Any) -> None:
     """
     takes = getattr(run.acts_in, "action_kind", "")
     entries = read_history(Path(meta.root)) if meta is not None else []
-    origin = next((entry for entry in entries if entry.get("operation") in ("record", "convert")), None)
-    if not takes or origin is None:
+    if not takes or origin_of(entries) is None:
         return
     recorded = "goals" if recorded_deltas(entries) is None else "differences"
     if recorded != takes:

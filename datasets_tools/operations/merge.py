@@ -112,16 +112,20 @@ def _check_together(sources: "Sequence[Source]") -> None:
 
 def _facts(first: "Source", other: "Source") -> list[tuple[str, Any, Any]]:
     """What must agree: its name, and how it is in both."""
-    from lerobot_cqn.delta_actions import description
+    from lerobot_cqn.delta_actions import description, recorded_deltas
 
     def deltas(source: "Source") -> Any:
         found = source.deltas
         return "absolute" if found is None else description(found, source.features)
 
+    def recorded(source: "Source") -> Any:
+        return recorded_deltas(source.history()) or "goals"
+
     facts: list[tuple[str, Any, Any]] = [
         ("frames a second", first.fps, other.fps),
         ("the robot", first.meta.robot_type, other.meta.robot_type),
         ("actions that are", deltas(first), deltas(other)),
+        ("actions recorded as", recorded(first), recorded(other)),
         ("the columns", ", ".join(sorted(first.features)), ", ".join(sorted(other.features))),
     ]
     for key in first.features.keys() & other.features.keys():

@@ -76,6 +76,21 @@ def test_in_the_station_differences_are_sent_whatever_the_policy_learned(recorde
             np.testing.assert_allclose(one, other, atol=2e-5)
 
 
+def test_merged_recordings_are_driven_as_each_of_them(recorded: Path, tmp_path: Path) -> None:
+    once = by_episode(recorded)
+    for name, options in (("differences", None), ("goals", ["--to=absolute"])):
+        parts = [tmp_path / f"{name}{i}" for i in range(2)]
+        for part in parts:
+            if options is None:
+                shutil.copytree(recorded, part)
+            else:
+                made("delta", recorded, part, *options)
+        given = ["--repo_ids=[local/a, local/c]", f"--roots=[{parts[0]}, {parts[1]}]", "--new_repo_id=local/b"]
+        assert cqn_data(["merge", *given, f"--new_root={tmp_path / name}"]) == 0
+        for one, other in zip(sent(tmp_path / name, tmp_path / f"of_{name}"), [*once, *once], strict=True):
+            np.testing.assert_allclose(one, other, atol=2e-5)
+
+
 def test_in_rlbench_goals_are_sent_whatever_the_policy_learned(tmp_path: Path) -> None:
     write_rlbench(tmp_path / "in")
     convert = ["convert", "--from=rlbench", f"--input={tmp_path / 'in'}", "--new_repo_id=local/a", "--video=false"]
