@@ -27,8 +27,17 @@ from cqn_train.robot.settings import ArmSettings
 from cqn_train.sim_arm import FAULTS, SimLeaderConfig, SimUR5eConfig
 from lerobot_cqn.base_config import RLConfig
 from lerobot_cqn.configuration_cqn import CQNConfig
+from lerobot_cqn.configuration_cqn_as import CQNASConfig
 from lerobot_cqn.configuration_drqv2 import DrQv2Config
-from lerobot_cqn.settings import DRQV2_PRESETS, PRESETS, CommonSettings, CQNSettings, DrQv2Settings
+from lerobot_cqn.settings import (
+    CQN_AS_PRESETS,
+    DRQV2_PRESETS,
+    PRESETS,
+    CommonSettings,
+    CQNASSettings,
+    CQNSettings,
+    DrQv2Settings,
+)
 
 TARGET = Path(__file__).with_name("configuration.md")
 
@@ -266,10 +275,11 @@ def training() -> list[str]:
 
 def policies() -> list[str]:
     """Sections on the policies."""
-    numbers = {field.name for kind in (CQNSettings, DrQv2Settings) for field in dataclasses.fields(kind)}
-    parts = ["## Policies", "### Common to both", options(rows(RLConfig, sorted(numbers)), "policy.")]
+    numbers = {field.name for kind in (CQNASSettings, DrQv2Settings) for field in dataclasses.fields(kind)}
+    parts = ["## Policies", "### Common to all", options(rows(RLConfig, sorted(numbers)), "policy.")]
     for name, kind, settings, columns in (
         ("cqn", CQNConfig, CQNSettings, PRESETS),
+        ("cqn_as", CQNASConfig, CQNASSettings, CQN_AS_PRESETS),
         ("drqv2", DrQv2Config, DrQv2Settings, DRQV2_PRESETS),
     ):
         parts += [

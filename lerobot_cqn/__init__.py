@@ -9,17 +9,21 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from .errors import ConfigError, CQNError, DataError, OutputError, OutputExistsError
-from .settings import DRQV2_PRESETS, PRESETS, CQNSettings, DrQv2Settings
+from .settings import CQN_AS_PRESETS, DRQV2_PRESETS, PRESETS, CQNASSettings, CQNSettings, DrQv2Settings
 
 if TYPE_CHECKING:
     from .configuration_cqn import CQNConfig
+    from .configuration_cqn_as import CQNASConfig
     from .configuration_drqv2 import DrQv2Config
     from .processors import BoundObservationProcessorStep
 
 __all__ = [
+    "CQN_AS_PRESETS",
     "DRQV2_PRESETS",
     "PRESETS",
     "BoundObservationProcessorStep",
+    "CQNASConfig",
+    "CQNASSettings",
     "CQNConfig",
     "CQNError",
     "CQNSettings",
@@ -33,6 +37,7 @@ __all__ = [
 
 _ON_USE = {
     "BoundObservationProcessorStep": "processors",
+    "CQNASConfig": "configuration_cqn_as",
     "CQNConfig": "configuration_cqn",
     "DrQv2Config": "configuration_drqv2",
 }

@@ -55,6 +55,7 @@ class RLConfig(PreTrainedConfig):
     lr: float | None = None
     weight_decay: float | None = None
     tau: float | None = None
+    target_interval: int | None = None
     # Acting
     exploration_noise: float | None = None
     # Speed

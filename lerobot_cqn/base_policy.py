@@ -81,6 +81,10 @@ class RLPolicy(PreTrainedPolicy):
     def forget_newest(self) -> None:
         """Forget the last frame that was observed; another one takes its place."""
         self._queue.pop()
+        self.forget_plan()
+
+    def forget_plan(self) -> None:
+        """Nothing: a policy of single actions plans none ahead."""
 
     def observe(self, batch: dict[str, Tensor]) -> Observation:
         """Push one frame [B, ...] per feature and return the stacked history; the first frame is repeated.
@@ -153,7 +157,7 @@ class RLPolicy(PreTrainedPolicy):
         now = [deltas.index(index) for index in range(1 - s.frame_stack, 1)]
         frames = {key: self._with_time(batch, key) for key in (*self.view_keys, *self.low_dim_keys)}
         observation = self.stack({key: value[:, now] for key, value in frames.items()})
-        action = batch[ACTION].reshape(len(batch[ACTION]), -1, self.action_dims)[:, 0]
+        action, real = self.actions_of(batch)
         demo = torch.ones_like(action[:, :1])
         if s.rl_loss_scale == 0:  # imitation only: rewards and next observations are not read
             return Batch(
@@ -163,6 +167,7 @@ class RLPolicy(PreTrainedPolicy):
                 discount=demo * 0,
                 next_observation=observation,
                 demo=demo,
+                real=real,
             )
         reward, discount, window = self._n_step(batch, action)
         # The stack that ends where the window does. An offset that was not loaded lies at the episode's end, where
@@ -178,7 +183,12 @@ class RLPolicy(PreTrainedPolicy):
             discount=discount,
             next_observation=next_observation,
             demo=demo,
+            real=real,
         )
+
+    def actions_of(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:
+        """What was done in LeRobot's batch, [B, D], and which of its numbers count (`Batch.real`)."""
+        return batch[ACTION].reshape(len(batch[ACTION]), -1, self.action_dims)[:, 0], None
 
     def _n_step(self, batch: dict[str, Tensor], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Discounted reward sum, bootstrap discount and length of the window in steps, all [B, 1]."""

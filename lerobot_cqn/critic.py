@@ -1,6 +1,7 @@
 """The coarse-to-fine critic: action selection (Algorithm 1) and the loss (Algorithm 2) over all levels."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -11,6 +12,7 @@ from .distributional import expectation, project_onto_support
 from .losses import (
     demo_mean,
     dominance_loss,
+    entry_mean,
     margin_loss,
     mean_log_probs,
     q_learning_loss,
@@ -41,18 +43,23 @@ class CQNModel(Model):
         shape = NetworkShape(
             pixel_size=self.pixel_size, low_dim_size=low_dim_size * settings.frame_stack,
             feature_dim=settings.feature_dim, hidden_dim=settings.hidden_dim, dims=dims, levels=settings.levels,
-            bins=settings.bins, atoms=settings.critic_atoms,
+            bins=settings.bins, atoms=settings.critic_atoms, **self.shape_of_sequences(),
         )  # fmt: skip
         self.critic, self.target_critic = CoarseToFineNetwork(shape), CoarseToFineNetwork(shape)
         initialise(self)
-        zero_head(self.critic.advantage)
-        zero_head(self.critic.value)
+        for stream in (self.critic.advantage, self.critic.value):
+            if stream is not None:
+                zero_head(stream)
         self.target_critic.load_state_dict(self.critic.state_dict())
         self.target_critic.requires_grad_(False)
 
     def averaged(self) -> Sequence[tuple[nn.Module, nn.Module]]:
         """The target critic follows the critic; the reference has no target encoder."""
         return [(self.target_critic, self.critic)]
+
+    def shape_of_sequences(self) -> dict[str, Any]:
+        """Fields of `NetworkShape` that say how sequences are valued; none for single actions."""
+        return {}
 
     # -- values --------------------------------------------------------------------------------------------
 
@@ -79,13 +86,14 @@ class CQNModel(Model):
         random_below: where Q spreads less than this over the bins, a random bin is taken (0: never).
         """
         s = self.settings
-        low = torch.full((precomputed.value.shape[0], critic.shape.dims), -1.0, device=precomputed.value.device)
+        size, device = len(precomputed.advantage), precomputed.advantage.device
+        low = torch.full((size, critic.shape.entries), -1.0, device=device)
         high = -low
         indices, chosen = [], []
         for level in range(s.levels):
             centre = (low + high) / 2
             with self.autocast():
-                logits = critic(precomputed, centre[:, None], torch.tensor([level], device=low.device))
+                logits = critic(precomputed, centre[:, None], torch.tensor([level], device=device))
             q = self.q_values(logits[:, 0])  # [B, D, N]
             index = q.argmax(-1)
             if random_below > 0:
@@ -97,16 +105,25 @@ class CQNModel(Model):
         return torch.stack(indices, dim=1), torch.stack(chosen).mean((0, 2))
 
     @torch.no_grad()
-    def act(self, observation: Observation, explore: bool = False) -> tuple[Tensor, Tensor]:
+    def choose(self, observation: Observation, explore: bool = False) -> tuple[Tensor, Tensor]:
         """Greedy action [B, D] in [-1, 1] and its mean Q [B], from the critic that `act_with` names.
 
-        explore: with Gaussian noise, then the nearest representable action.
+        explore: where the critic has no preference, a random bin.
         """
         s = self.settings
         critic = self.target_critic if s.act_with == "target" else self.critic
         precomputed = self.precompute(critic, self.encode(observation))
         indices, q = self.greedy(critic, precomputed, s.random_bin_below if explore else 0.0)
-        action = decode(indices, s.bins)
+        return decode(indices, s.bins), q
+
+    @torch.no_grad()
+    def act(self, observation: Observation, explore: bool = False) -> tuple[Tensor, Tensor]:
+        """Greedy action [B, D] in [-1, 1] and its mean Q [B].
+
+        explore: with Gaussian noise, then the nearest representable action.
+        """
+        s = self.settings
+        action, q = self.choose(observation, explore)
         if explore and s.exploration_noise > 0:
             action = snap(action + s.exploration_noise * torch.randn_like(action), s.levels, s.bins)
         return action, q
@@ -135,7 +152,7 @@ class CQNModel(Model):
         """Loss of Algorithm 2 and its parts (detached scalars) for an already augmented batch."""
         s = self.settings
         precomputed = self.precompute(self.critic, self.encode(batch.observation))
-        indices = encode(batch.action, s.levels, s.bins)
+        indices, real = encode(batch.action, s.levels, s.bins), batch.real
         logits = self.evaluate(self.critic, precomputed, indices)
         total = logits.new_zeros(())
         stats: dict[str, Tensor] = {}
@@ -143,23 +160,27 @@ class CQNModel(Model):
             with torch.no_grad():
                 target = self.td_target(self.encode(batch.next_observation), batch.reward, batch.discount)
             taken = take_bin(logits, indices)[..., 0, :]
-            if s.centralized_critic:
-                taken = mean_log_probs(taken) if s.distributional else taken.mean(2, keepdim=True)
-                target = target.mean(2, keepdim=True)
+            counts = real
+            if s.centralized_critic:  # the mean over D of each step: [B, L, T, A]
+                split = (self.critic.shape.sequence or 1, self.critic.shape.dims)
+                taken, target = (x.view(*x.shape[:2], *split, *x.shape[3:]) for x in (taken, target))
+                taken = mean_log_probs(taken) if s.distributional else taken.mean(3)
+                target, counts = target.mean(3), None if real is None else real[:, :: split[1]]
             if s.distributional:
-                rl = q_learning_loss(taken, target).mean()
+                rl = q_learning_loss(taken, target, counts).mean()
             else:
-                rl = scalar_q_learning_loss(taken[..., 0], target).mean()
+                rl = scalar_q_learning_loss(taken[..., 0], target, counts).mean()
             total = total + s.rl_loss_scale * rl
             expected = expectation(target, self.support) if s.distributional else target
-            stats["rl_loss"], stats["td_error"] = rl.detach(), (self.q_values(taken.detach()) - expected).abs().mean()
+            error = entry_mean((self.q_values(taken.detach()) - expected).abs(), counts).mean()
+            stats["rl_loss"], stats["td_error"] = rl.detach(), error
         if s.bc_loss_scale > 0:
             probs = F.softmax(logits, dim=-1) if s.distributional else logits
             q = expectation(probs, self.support) if s.distributional else logits[..., 0]
-            bc = demo_mean(margin_loss(q, indices, s.bc_margin), batch.demo)
+            bc = demo_mean(margin_loss(q, indices, s.bc_margin, real), batch.demo)
             stats["bc_margin_loss"] = bc.detach()
             if s.distributional and s.bc_dominance:
-                dominance = demo_mean(dominance_loss(probs, indices), batch.demo)
+                dominance = demo_mean(dominance_loss(probs, indices, real), batch.demo)
                 stats["bc_dominance_loss"] = dominance.detach()
                 bc = bc + dominance
             total = total + s.bc_loss_scale * bc

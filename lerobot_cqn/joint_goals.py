@@ -100,7 +100,8 @@ class _JointsStep(AbsoluteActionsProcessorStep):
     """What both ways have: the joints that a partner remembers, and the goals that were sent.
 
     For kind "command_steps" it remembers the last goal, which starts from the measured joints. A control step begins
-    with a new frame; asking again in the same one gives the same answer.
+    with a new frame; asking again in the same one gives the same answer. Another action in the same frame would belong
+    to a later step, whose joints nobody knows yet: a sequence of differences is driven step by step or not at all.
 
     Attributes:
         deltas: which dimensions are differences, and of what.
@@ -122,6 +123,7 @@ class _JointsStep(AbsoluteActionsProcessorStep):
         self._frame = -1
         self._before: Tensor | None = None  # the goal that this step's is a difference from
         self._goal: Tensor | None = None  # this step's own
+        self._asked: Tensor | None = None  # for this frame
 
     def sent(self, goal: Tensor | None) -> None:
         """The goal [K, D] that was really sent in this step; None: none was, and the next starts from the joints."""
@@ -150,7 +152,7 @@ class _JointsStep(AbsoluteActionsProcessorStep):
                 "the observation before the first action, found none; run the preprocessor on one that has it."
             )
         if partner.frames != self._frame:
-            self._frame, self._before = partner.frames, self._goal
+            self._frame, self._before, self._asked = partner.frames, self._goal, None
         if self._before is None:
             self._before = torch.zeros_like(like, dtype=state.dtype, device=state.device)
             self._before[..., list(self.deltas.action_dims)] = state[..., list(self.deltas.state_dims)]
@@ -167,6 +169,13 @@ class DeltaToGoalProcessorStep(_JointsStep):
         if not isinstance(action, Tensor):
             return transition
         state, before = self._remembered(action)
+        if action.ndim > state.ndim or (self._asked is not None and not torch.equal(self._asked, action)):
+            raise DataError(
+                "A sequence of joint differences cannot be driven from one frame: each is from its own step's joints."
+                " Drive step by step (lerobot-rollout with --inference.type=sync, lerobot-eval, cqn-train), or train on"
+                " absolute actions."
+            )
+        self._asked = action.detach().clone()
         self._goal = goal_of(action, state, before, self.deltas)
         changed = transition.copy()
         changed[TransitionKey.ACTION] = self._goal.clone()

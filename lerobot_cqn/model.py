@@ -26,6 +26,7 @@ class Model(nn.Module):
     """
 
     support: Tensor
+    updates: Tensor
     settings: CommonSettings
 
     def __init__(self, views: Mapping[str, tuple[int, int, int]], settings: CommonSettings, *, plain: bool) -> None:
@@ -39,6 +40,8 @@ class Model(nn.Module):
         self.pixel_size = sum(encoder.out_features for encoder in encoders)
         values = support(settings.v_min, settings.v_max, settings.critic_atoms)
         self.register_buffer("support", values, persistent=False)
+        if settings.target_interval > 1:  # of a resumed run, too
+            self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
 
     # -- what a method says ----------------------------------------------------------------------------------
 
@@ -96,7 +99,11 @@ class Model(nn.Module):
 
     @torch.no_grad()
     def update_target(self) -> None:
-        """Polyak step: target <- (1 - tau) * target + tau * online (Algorithm 2, last line)."""
+        """Polyak step: target <- (1 - tau) * target + tau * online (Algorithm 2, last line), where one is due."""
+        if self.settings.target_interval > 1:
+            self.updates += 1
+            if self.updates % self.settings.target_interval:
+                return
         for target, online in self.averaged():
             torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), self.settings.tau)
 

@@ -39,6 +39,10 @@ METHODS = {
         "It has a critic and no actor: it looks for the action of the highest Q-value in a few intervals of each "
         "action dimension, then zooms into the best one, level by level.",
     ),
+    "cqn_as": (
+        "CQN-AS",
+        "It is CQN whose critic values a sequence of the next actions (Seo and Abbeel 2024).",
+    ),
     "drqv2": ("DrQ-v2", "It is the actor-critic baseline of the CQN paper, with a distributional critic in DrQ-v2+."),
 }
 # Of a configuration, what is a machine's own or follows from the rest.

@@ -9,6 +9,7 @@ Shape legend, used in every comment on shapes:
     D  action dimensions
     N  bins per level
     A  atoms of the value distribution (1 when the critic is scalar)
+    T  actions of a sequence, of an episode its steps
     P  low-dimensional values of one frame (joints, environment state)
     n  length of the n-step return
 """
@@ -72,10 +73,12 @@ class Observation:
 class Batch:
     """n-step transitions.
 
-    action: [B, D] in [-1, 1].
+    action: [B, D] in [-1, 1]; of action sequences [B, T*D], step by step.
     reward: [B, 1] discounted sum of the rewards inside the n-step window.
     discount: [B, 1] factor of the bootstrap value: gamma**k for a window of k steps, 0 after a termination.
     demo: [B, 1] 1.0 where the sample is a demonstration (or was relabelled as one), else 0.0.
+    real: [B, T*D] 0.0 where a number of the action only fills the sequence and is not learned from, else 1.0; None: all
+        count.
     """
 
     observation: Observation
@@ -84,6 +87,7 @@ class Batch:
     discount: "Tensor"
     next_observation: Observation
     demo: "Tensor"
+    real: "Tensor | None" = None
 
     def to(self, device: "torch.device | str") -> Self:
         """Return the same batch on `device`."""
@@ -94,6 +98,7 @@ class Batch:
             discount=self.discount.to(device, non_blocking=True),
             next_observation=self.next_observation.to(device),
             demo=self.demo.to(device, non_blocking=True),
+            real=None if self.real is None else self.real.to(device, non_blocking=True),
         )
 
 

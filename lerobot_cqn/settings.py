@@ -7,7 +7,16 @@ from typing import Any
 from .errors import ConfigError, one_of
 from .ranges import check_ranges, number
 
-__all__ = ["DRQV2_PRESETS", "PRESETS", "CQNSettings", "CommonSettings", "DrQv2Settings", "resolve"]
+__all__ = [
+    "CQN_AS_PRESETS",
+    "DRQV2_PRESETS",
+    "PRESETS",
+    "CQNASSettings",
+    "CQNSettings",
+    "CommonSettings",
+    "DrQv2Settings",
+    "resolve",
+]
 
 
 @dataclass(frozen=True)
@@ -44,7 +53,8 @@ class CommonSettings:
     # Optimisation
     lr: float = number(5e-5, above=0)  # learning rate of AdamW
     weight_decay: float = number(0.1, least=0)  # of AdamW
-    tau: float = number(0.02, above=0, most=1)  # share by which the target network follows in each update
+    tau: float = number(0.02, above=0, most=1)  # share by which the target network follows in each step of its own
+    target_interval: int = number(1, least=1)  # updates between steps of the target network
     # Acting
     # standard deviation of the noise on actions in [-1, 1], in training episodes only
     exploration_noise: float = number(0.01, least=0)
@@ -98,6 +108,37 @@ class CQNSettings(CommonSettings):
 
 
 @dataclass(frozen=True)
+class CQNASSettings(CQNSettings):
+    """Hyperparameters of CQN-AS (Seo and Abbeel 2024); the defaults are the authors' configuration for RLBench.
+
+    Raises ConfigError when a value is out of its range.
+    """
+
+    v_min: float = -2.0
+    v_max: float = 2.0
+    n_step: int = number(1, least=1, most=1000)
+    # Sequence
+    action_sequence: int = number(4, least=1, most=64)  # T, actions that the critic values at once
+    # what stands for actions after the end of an episode: "zeros" or the "last" one, which are learned from like any
+    # other, as the authors' code does; "mask" leaves them out of the losses
+    sequence_fill: str = "zeros"
+    # Networks
+    gru_layers: int = number(1, least=1, most=8)  # of the core that goes along the sequence
+    pixel_projection_layers: int = number(0, least=0, most=8)  # R, layers of width `hidden_dim` before the projection
+    dueling: bool = True  # False: bins are valued by one stream alone
+    project_state: bool = True  # False: numbers enter the trunk as they are, without a projection
+    # Acting
+    temporal_ensemble: bool = True  # mean of what the last T sequences say; False: a sequence is played to its end
+    ensemble_gain: float = number(0.01, least=0)  # weights exp(-gain * i), i = 0 for the oldest sequence
+
+    def __post_init__(self) -> None:
+        """Check ranges, and the choice of what fills a sequence."""
+        super().__post_init__()
+        if self.sequence_fill not in (fills := ("zeros", "last", "mask")):
+            raise ConfigError(one_of("value of `sequence_fill`", self.sequence_fill, fills))
+
+
+@dataclass(frozen=True)
 class DrQv2Settings(CommonSettings):
     """Hyperparameters of DrQ-v2 and DrQ-v2+; the defaults are DrQ-v2+'s column of the paper's last table.
 
@@ -138,6 +179,26 @@ PRESETS: dict[str, dict[str, Any]] = {
     "practice_state": {"frame_stack": 8, "feature_dim": 256, "hidden_dim": 256, "lr": 3e-4, "rl_loss_scale": 1.0},
 }
 
+
+_LAPTOP_PIXELS: dict[str, Any] = {**PRESETS["laptop_pixels"], "v_min": -1.0, "v_max": 1.0, "n_step": 3}
+_LAPTOP_STATE: dict[str, Any] = {**PRESETS["laptop_state"], "v_min": -1.0, "v_max": 1.0, "n_step": 3}
+CQN_AS_PRESETS: dict[str, dict[str, Any]] = {
+    # The authors' configurations.
+    "cqn_as_rlbench": {"bound_margin": 0.2},
+    "cqn_as_bigym": {
+        "frame_stack": 4, "action_sequence": 16, "pixel_projection_layers": 2, "bc_margin": 0.1,
+        "sequence_fill": "last",
+    },
+    # State and dense rewards, no demonstrations: scalar values, one stream, a hard copy as the target.
+    "cqn_as_humanoid": {
+        "frame_stack": 1, "hidden_dim": 1024, "distributional": False, "dueling": False, "project_state": False,
+        "bc_loss_scale": 0.0, "rl_loss_scale": 1.0, "n_step": 3, "tau": 1.0, "target_interval": 100,
+        "act_with": "online", "sequence_fill": "last", "state_bound": 1e6,
+    },
+    # Ours: CQN's presets of the same names, with sequences; what lies beyond an episode's end is not learned from.
+    "laptop_state": {**_LAPTOP_STATE, "sequence_fill": "mask"},
+    "laptop_pixels": {**_LAPTOP_PIXELS, "sequence_fill": "mask"},
+}  # fmt: skip
 
 _DRQV2: dict[str, Any] = {"distributional": False, "exploration_noise": 0.2, "weight_decay": 0.0}
 _REAL_WORLD: dict[str, Any] = {"frame_stack": 4, "brightness": 0.2, "contrast": 0.2}

@@ -66,6 +66,7 @@ class Agent:
             step.sent(outcome.sent)
         if not outcome.taught:
             return action
+        self.policy.forget_plan()  # made for a course that the person left
         (normaliser,) = (s for s in self.preprocessor.steps if isinstance(s, NormalizerProcessorStep))
         scaled: torch.Tensor = normaliser(create_transition(action=wanted.float()))[TransitionKey.ACTION]
         return scaled.clamp(-1.0, 1.0).to(action)
@@ -79,9 +80,14 @@ class Agent:
     def _goal_steps(self) -> list[DeltaToGoalProcessorStep]:
         return [step for step in self.postprocessor.steps if isinstance(step, DeltaToGoalProcessorStep)]
 
-    def act(self, prepared: Frame, *, explore: bool) -> tuple[torch.Tensor, NDArray[Any]]:
-        """Normalised actions [K, D] in [-1, 1] for K rows, and the mean Q [K] of each."""
+    def act(self, prepared: Frame, *, explore: bool, at_random: bool = False) -> tuple[torch.Tensor, NDArray[Any]]:
+        """Normalised actions [K, D] in [-1, 1] for K rows, and the mean Q [K] of what the policy would do.
+
+        at_random: uniform actions instead of its own.
+        """
         action, q = self.policy.act(prepared, explore=explore)
+        if at_random:
+            action = 2 * torch.rand_like(action) - 1
         return action, q.float().cpu().numpy()
 
     def low_dim(self, prepared: Frame) -> NDArray[Any] | None:

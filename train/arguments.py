@@ -18,7 +18,7 @@ from lerobot.teleoperators.config import TeleoperatorConfig
 
 from cqn_data.terminal.mistakes import one_line
 from cqn_data.terminal.options import with_plugins
-from lerobot_cqn import configuration_cqn, configuration_drqv2, processors  # noqa: F401  # registers our policies
+from lerobot_cqn import configuration_cqn, configuration_cqn_as, configuration_drqv2, processors  # noqa: F401  # registers our policies
 from lerobot_cqn.errors import ConfigError
 
 from .arm.devices import register_devices
@@ -41,6 +41,7 @@ Train a Coarse-to-fine Q-Network from demonstrations, then online.
   continue after Ctrl-C or a crash:          cqn-train --resume=true --output_dir=outputs/click
   start from a trained policy:               cqn-train --policy.path=outputs/click/checkpoints/last/pretrained_model ...
   imitation only (the paper's CBC):          cqn-train --policy.rl_loss_scale=0 --steps=0 --offline_updates=5000 ...
+  with action sequences (CQN-AS):            cqn-train --policy.type=cqn_as --policy.preset=laptop_state ...
   the paper's actor-critic baseline:         cqn-train --policy.type=drqv2 --policy.preset=drqv2_plus ...
   without demonstrations:                    cqn-train --policy.preset=paper_dmc_state --env.type=dmc ...
   on an arm, with a person at a web page:    cqn-train --robot.type=so101_follower --robot.port=... \\
@@ -61,6 +62,13 @@ PRESETS: dict[str, dict[str, str]] = {
         "laptop_state": "ours: joints and object poses, small network, minutes on one core",
         "laptop_pixels": "ours: two small cameras, a laptop or one GPU",
         "practice_state": "ours: laptop_state with history and more weight on RL, for long practice",
+    },
+    "cqn_as": {
+        "cqn_as_rlbench": "CQN over action sequences, the authors' configuration for RLBench (default)",
+        "cqn_as_bigym": "the same for BiGym: sixteen actions, human demonstrations",
+        "cqn_as_humanoid": "the same for HumanoidBench: state, dense rewards, no demonstrations",
+        "laptop_state": "ours: CQN's laptop_state with sequences",
+        "laptop_pixels": "ours: CQN's laptop_pixels with sequences",
     },
     "drqv2": {
         "drqv2_plus": "the paper's DrQ-v2+: distributional critic, learns from demonstrations (default)",

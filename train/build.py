@@ -20,6 +20,7 @@ from lerobot_cqn.errors import ConfigError, OutputExistsError
 from lerobot_cqn.joint_goals import converted_deltas
 from lerobot_cqn.learner import Learner
 from lerobot_cqn.schema import read_history
+from lerobot_cqn.settings import CQNASSettings
 
 from .agent import Agent
 from .arm.build import make_operated, recall, steering
@@ -250,9 +251,10 @@ def check_actions(run: ValidRun, meta: Any) -> None:
 def make_replay(run: ValidRun) -> Replay:
     """An empty replay in the run's folder."""
     s, replay = run.policy.settings, run.config.replay
+    sequences = (s.action_sequence, s.sequence_fill) if isinstance(s, CQNASSettings) else (1, "mask")
     return Replay(
         s.frame_stack, s.n_step, s.discount, folder=run.output_dir / "replay", capacity_gib=replay.capacity_gib,
-        by_step=replay.sampling == "steps",
+        by_step=replay.sampling == "steps", sequence=sequences[0], fill=sequences[1],
     )  # fmt: skip
 
 

@@ -31,12 +31,25 @@ __all__ = [
 class Recipe:
     """Schedule of a run, where the paper gives each method numbers of its own; the defaults are CQN's on RLBench."""
 
-    updates_per_step: int = number(1, least=0, most=1000)  # after each control step
+    updates_per_step: int = number(1, least=0, most=1000)  # after control steps
+    update_interval: int = number(
+        1, least=1, most=1000
+    )  # control steps from one to the next after which there are some
     updates_per_episode: int = number(0, least=0, most=100_000)  # between episodes
     batch_size: int = number(256, least=0, most=65_536)  # from everything seen
     demo_batch_size: int = number(256, least=0, most=65_536)  # from demonstrations and successes, on top
     relabel: bool = True  # successful online episodes become demonstrations
+    random_steps: int = number(0, least=0)  # first control steps, of uniform actions and without updates
     action_bounds: str = "data"  # action -1..1 is the demonstrations' range, or that of the "environment"
+
+    def updates_of_steps(self, before: int, after: int) -> int:
+        """Updates that the control steps numbered `before` + 1 to `after` bring along."""
+        first = max(before, min(after, self.random_steps))
+        return self.updates_per_step * (after // self.update_interval - first // self.update_interval)
+
+    def updates_of_episode(self, steps: int) -> int:
+        """Updates after an episode that ends with control step number `steps`."""
+        return self.updates_per_episode if steps > self.random_steps else 0
 
 
 # Of each policy preset (table 2 and the last table of the appendix); presets that are not here use the defaults.
@@ -47,6 +60,10 @@ _RECIPES: dict[str, Recipe] = {
     "laptop_state": Recipe(batch_size=64, demo_batch_size=64),
     "laptop_pixels": Recipe(updates_per_step=0, updates_per_episode=25, batch_size=64, demo_batch_size=64),
     "practice_state": Recipe(updates_per_step=0, updates_per_episode=25, batch_size=64, demo_batch_size=64),
+    # CQN-AS (lerobot_cqn/settings.py); on RLBench and BiGym the authors' schedule is CQN's.
+    "cqn_as_humanoid": Recipe(
+        update_interval=2, batch_size=128, demo_batch_size=0, random_steps=10_000, action_bounds="environment"
+    ),
     "drqv2": Recipe(batch_size=512, demo_batch_size=0, relabel=False, action_bounds="environment"),
     "drqv2_plus_real_world": Recipe(updates_per_step=0, updates_per_episode=50),
     "drqv2_real_world": Recipe(
@@ -134,12 +151,15 @@ class RunConfig:
     # of acting and learning, waits for a person not counted; None: `steps` alone
     online_minutes: float | None = number(None, above=0)
     offline_updates: int = number(0, least=0)  # updates on the demonstrations before the first step
-    updates_per_step: int | None = None  # after each control step; None: the preset's
+    updates_per_step: int | None = None  # after control steps; None: the preset's
+    # control steps from one to the next after which there are updates; None: the preset's
+    update_interval: int | None = None
     updates_per_episode: int | None = None  # between episodes; None: the preset's
     async_updates: int = number(0, least=0)  # at most so many beside an episode; it acts with the policy it began with
     batch_size: int | None = None  # from everything seen; None: the preset's
     demo_batch_size: int | None = None  # from demonstrations and successes, on top; None: the preset's
     relabel: bool | None = None  # successful online episodes become demonstrations; None: the preset's
+    random_steps: int | None = None  # first control steps, of uniform actions and without updates; None: the preset's
     action_bounds: str | None = None  # -1..1 is the range of the "data" or of the "environment"; None: the preset's
     # environment steps between checkpoints; the end and an interrupt always save
     save_freq: int = number(5000, least=1)
@@ -156,7 +176,8 @@ class RunConfig:
             raise ConfigError("No policy: give --policy.type=cqn, or --policy.path=CHECKPOINT to continue from one.")
         if not isinstance(self.policy, RLConfig):
             raise ConfigError(
-                f"cqn-train trains --policy.type=cqn or drqv2, got '{self.policy.type}': use lerobot-train for that."
+                f"cqn-train trains --policy.type=cqn, cqn_as or drqv2, got '{self.policy.type}': use lerobot-train for "
+                "that."
             )
         if self.output_dir is None:
             raise ConfigError("No output directory: give --output_dir=DIR.")
@@ -212,6 +233,8 @@ class RunConfig:
                 "Updates after each step would make the arm jerk: leave out --updates_per_step, or give "
                 "--updates_per_episode, or --async_updates."
             )
+        if self.recipe.random_steps:
+            raise ConfigError("Uniform actions would throw the arm about: give --random_steps=0, or another preset.")
         check_ranges(self.page, "page.")
         if (self.page.certfile is None) != (self.page.keyfile is None):
             raise ConfigError("--page.certfile and --page.keyfile belong together: give both, or --page.tls=true.")

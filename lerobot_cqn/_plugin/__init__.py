@@ -6,6 +6,7 @@ The processors are among them: LeRobot imports a policy's when it makes new ones
 import cqn_train.envs
 import cqn_train.sim_arm
 import lerobot_cqn.configuration_cqn
+import lerobot_cqn.configuration_cqn_as
 import lerobot_cqn.configuration_drqv2
 import lerobot_cqn.processors
 

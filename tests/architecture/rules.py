@@ -34,9 +34,10 @@ FLOORS: dict[str, str] = {
     # tensors in, tensors out, never a configuration (up to losses); then networks; then what LeRobot sees
     "lerobot_cqn": (
         "errors schema|ranges discretisation|distributional|augmentation|n_step losses settings networks model "
-        "critic|actor_critic|learner delta_actions|scaling_check joint_goals|fit_pictures|history_text|hub_retry "
-        "base_config model_card|processors base_policy configuration_cqn|configuration_drqv2 "
-        "processor_cqn|processor_drqv2 modeling_cqn|modeling_drqv2"
+        "critic|actor_critic|learner sequence delta_actions|scaling_check "
+        "joint_goals|fit_pictures|history_text|hub_retry base_config model_card|processors base_policy "
+        "configuration_cqn|configuration_drqv2 configuration_cqn_as "
+        "processor_cqn|processor_cqn_as|processor_drqv2 modeling_cqn|modeling_cqn_as|modeling_drqv2"
     ),
     "datasets_tools": "terminal decisions|web views disk hub operations formats|inspection|review record|cli",
     "train": (

@@ -36,12 +36,18 @@ def demonstrations(recorded_arm: Path, command: Command, tmp_path_factory: pytes
 
 
 @pytest.mark.real_time(reason="lerobot-rollout drives the simulated arm for three seconds of the machine's own clock")
-@pytest.mark.parametrize(("trained", "robot"), [(STATE_ONLY, BLIND), (SMALL_EYES, ARM_CAMERA)], ids=["state", "camera"])
+@pytest.mark.parametrize(
+    ("trained", "robot"),
+    [(STATE_ONLY, BLIND), ([*STATE_ONLY, "--policy.type=cqn_as"], BLIND), (SMALL_EYES, ARM_CAMERA)],
+    ids=["state", "sequences", "camera"],
+)
 def test_rollout_sends_absolute_goals(
     trained: list[str], robot: list[str], demonstrations: Path, command: Command, tmp_path: Path
 ) -> None:
+    kind = [option for option in trained if option.startswith("--policy.type=")]
     command(
-        "lerobot-train", *TINY_POLICY, *trained, "--policy.push_to_hub=false", "--dataset.repo_id=local/cqn",
+        "lerobot-train", *TINY_POLICY[len(kind) :], *trained, "--policy.push_to_hub=false",
+        "--dataset.repo_id=local/cqn",
         f"--dataset.root={demonstrations}", "--batch_size=4", "--num_workers=0", "--steps=24", "--wandb.enable=false",
         f"--output_dir={tmp_path / 'run'}",
     )  # fmt: skip

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from .check import CHECKS, check_file, main
+from .check import CHECKS, check_file, kind, main
 
 HERE = Path(__file__).parent
 FILES = sorted(HERE.glob("*.npz"))
@@ -17,7 +17,7 @@ def test_agrees_with_the_authors_implementation(path: Path) -> None:
 
 
 def test_every_kind_of_file_is_there() -> None:
-    assert {path.stem.split("_")[0] for path in FILES} == set(CHECKS)
+    assert {kind(path) for path in FILES} == set(CHECKS)
 
 
 def test_command_reports_what_it_checked(capsys: pytest.CaptureFixture[str]) -> None:

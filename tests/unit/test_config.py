@@ -166,15 +166,22 @@ def test_the_recipe_follows_the_policys_preset() -> None:
         start = [f"--policy.type={policy}", "--policy.device=cpu"]
         return draccus.parse(RunConfig, args=[*start, *arguments]).recipe
 
-    assert recipe() == Recipe(1, 0, 256, 256, relabel=True, action_bounds="data")
+    assert recipe() == Recipe(
+        updates_per_step=1, updates_per_episode=0, batch_size=256, demo_batch_size=256, relabel=True,
+        action_bounds="data",
+    )  # fmt: skip
     assert recipe("--policy.preset=paper_real_world").updates_per_episode == 50
     assert recipe("--policy.preset=paper_dmc_state").demo_batch_size == 0
     mixed = recipe("--policy.preset=paper_real_world", "--batch_size=8", "--updates_per_step=2", "--relabel=false")
-    assert mixed == Recipe(2, 50, 8, 256, relabel=False)
+    assert mixed == Recipe(
+        updates_per_step=2, updates_per_episode=50, batch_size=8, demo_batch_size=256, relabel=False
+    )  # fmt: skip
     # The paper's last table: DrQ-v2+ has the recipes of CQN, DrQ-v2 has not.
     assert recipe(policy="drqv2") == Recipe()
     plain = recipe("--policy.preset=drqv2", policy="drqv2")
-    assert plain == Recipe(1, 0, 512, 0, relabel=False, action_bounds="environment")
+    assert plain == Recipe(batch_size=512, demo_batch_size=0, relabel=False, action_bounds="environment")
+    humanoid = recipe("--policy.preset=cqn_as_humanoid", policy="cqn_as")
+    assert (humanoid.update_interval, humanoid.batch_size, humanoid.random_steps) == (2, 128, 10_000)
 
 
 def test_runs_are_checked() -> None:
@@ -261,9 +268,9 @@ def test_a_leader_needs_an_arm() -> None:
 
 def test_help_names_every_preset() -> None:
     from cqn_train.arguments import introduction
-    from lerobot_cqn.settings import DRQV2_PRESETS
+    from lerobot_cqn.settings import CQN_AS_PRESETS, DRQV2_PRESETS
 
     lines = introduction().splitlines()
-    for policy, presets in (("cqn", PRESETS), ("drqv2", DRQV2_PRESETS)):
+    for policy, presets in (("cqn", PRESETS), ("cqn_as", CQN_AS_PRESETS), ("drqv2", DRQV2_PRESETS)):
         shown = [line.split()[1] for line in lines if line.strip().startswith(f"--policy.type={policy} ")]
         assert sorted(shown) == sorted(presets)

@@ -115,6 +115,21 @@ def test_a_recording_is_driven_as_the_tools_say(kind: Any, seed: int) -> None:
             torch.testing.assert_close(to_goal.action_of(goal), written[:, t], rtol=0, atol=1e-9)
 
 
+def test_a_sequence_of_differences_is_not_driven_from_one_frame() -> None:
+    remember = RememberJointsProcessorStep()
+    to_goal = DeltaToGoalProcessorStep("command", ACTION_DIMS, STATE_DIMS, remember)
+    seen: Any = {"observation": {"observation.state": torch.zeros(1, P)}}
+    remember(seen)
+    sequence = torch.randn(1, 3, D)
+    with pytest.raises(DataError, match="step by step"):
+        to_goal({"action": sequence})  # type: ignore[typeddict-item]
+    to_goal({"action": sequence[:, 0]})  # type: ignore[typeddict-item]
+    with pytest.raises(DataError, match="cannot be driven from one frame"):  # as LeRobot's policy server asks
+        to_goal({"action": sequence[:, 1]})  # type: ignore[typeddict-item]
+    remember(seen)
+    to_goal({"action": sequence[:, 1]})  # type: ignore[typeddict-item]
+
+
 # -- the pipelines -----------------------------------------------------------------------------------------------------
 
 

@@ -13,8 +13,10 @@ from torch import Tensor
 from lerobot_cqn.critic import CQNModel
 from lerobot_cqn.learner import Learner
 from lerobot_cqn.schema import Batch, Observation
-from lerobot_cqn.settings import CQNSettings
+from lerobot_cqn.sequence import CQNASModel
+from lerobot_cqn.settings import CQNASSettings, CQNSettings
 from tests.oracle import Oracle, largest_share
+from tests.oracle_sequence import SequenceOracle
 
 SIDE, P = 20, 3
 SMALL = {
@@ -24,10 +26,15 @@ SMALL = {
 
 
 def build(views: int, low_dim: int, dims: int, **changes: object) -> CQNModel:
-    """A model with random heads and a target that differs from the online critic."""
+    """A model with random heads and a target that differs from the online critic; with a sequence it is CQN-AS's."""
     torch.manual_seed(0)
-    settings = CQNSettings(**(SMALL | changes))  # type: ignore[arg-type]
-    model = CQNModel({str(view): (3, SIDE, SIDE + 4 * view) for view in range(views)}, low_dim, dims, settings)
+    cameras = {str(view): (3, SIDE, SIDE + 4 * view) for view in range(views)}
+    model: CQNModel
+    if "action_sequence" in changes:
+        settings = CQNASSettings(**(SMALL | changes))  # type: ignore[arg-type]
+        model = CQNASModel(cameras, low_dim, dims, settings)
+    else:
+        model = CQNModel(cameras, low_dim, dims, CQNSettings(**(SMALL | changes)))  # type: ignore[arg-type]
     with torch.no_grad():
         for critic in (model.critic, model.target_critic):
             for name, weight in critic.named_parameters():
@@ -36,6 +43,10 @@ def build(views: int, low_dim: int, dims: int, **changes: object) -> CQNModel:
                 else:
                     weight.add_(0.05 * torch.randn_like(weight))
     return model
+
+
+def plain(model: CQNModel, dtype: torch.dtype = torch.float32) -> Oracle:
+    return SequenceOracle(model, dtype) if isinstance(model, CQNASModel) else Oracle(model, dtype)
 
 
 def random_batch(model: CQNModel, views: int, low_dim: int, demo: str = "some", size: int = 6) -> Batch:
@@ -47,7 +58,7 @@ def random_batch(model: CQNModel, views: int, low_dim: int, demo: str = "some", 
 
     flags = {"some": [1.0, 0.0, 1.0, 0.0, 0.0, 1.0], "none": [0.0] * size, "all": [1.0] * size}[demo]
     discount = torch.tensor([0.9, 0.0, 0.97, 0.97, 0.0, 1.0])[:, None]
-    action = 2 * torch.rand(size, model.critic.shape.dims) - 1
+    action = 2 * torch.rand(size, model.critic.shape.entries) - 1
     return Batch(
         observation=observation(),
         action=action,
@@ -60,7 +71,7 @@ def random_batch(model: CQNModel, views: int, low_dim: int, demo: str = "some", 
 
 def compare(views: int, low_dim: int, dims: int, demo: str = "some", updates: int = 3, **changes: object) -> None:
     model = build(views, low_dim, dims, **changes)
-    exact = Oracle(model, torch.float64)
+    exact = plain(model, torch.float64)
     learner = Learner(model)
     batch = random_batch(model, views, low_dim, demo)
 
@@ -143,6 +154,24 @@ def test_ablations(changes: dict[str, object]) -> None:
     compare(1, P, 2, levels=2, **changes)
 
 
+@pytest.mark.parametrize("steps", [1, 2, 4])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"levels": 1, "bins": 3},
+        {"gru_layers": 2, "distributional": False},
+        {"dueling": False, "project_state": False, "distributional": False, "bc_loss_scale": 0.0},
+        {"pixel_projection_layers": 2, "frame_stack": 2, "rl_loss_scale": 0.0},
+        {"next_action_from": "target", "dueling": False},
+    ],
+    ids=str,
+)
+def test_sequences(steps: int, changes: dict[str, object]) -> None:
+    views = 1 if "pixel_projection_layers" in changes else 0
+    compare(views, P, 2, updates=2, action_sequence=steps, **({"levels": 2, "atoms": 5} | changes))
+
+
 @pytest.mark.parametrize("distributional", [True, False])
 def test_new_critic_with_tied_bins(distributional: bool) -> None:
     """Zero heads: every bin ties, where subgradients and argmax could be taken differently."""
@@ -169,10 +198,19 @@ def test_without_demonstrations_the_imitation_terms_are_exactly_zero() -> None:
 
 
 @pytest.mark.parametrize("act_with", ["online", "target"])
+def test_greedy_sequence(act_with: str) -> None:
+    model = build(0, P, 2, act_with=act_with, action_sequence=3)
+    oracle, observation = plain(model), random_batch(model, 0, P).observation
+    sequence, _ = model.act(observation)
+    critic = "critic" if act_with == "online" else "target_critic"
+    assert torch.allclose(sequence, oracle.inference(critic, oracle.encode(observation))[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("act_with", ["online", "target"])
 @pytest.mark.parametrize("distributional", [True, False])
 def test_greedy_action(act_with: str, distributional: bool) -> None:
     model = build(1, P, 4, act_with=act_with, distributional=distributional)
-    oracle = Oracle(model)
+    oracle = plain(model)
     observation = random_batch(model, 1, P).observation
     action, q = model.act(observation)
     features = oracle.encode(observation)

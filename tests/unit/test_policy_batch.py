@@ -16,6 +16,7 @@ from cqn_train.config import DatasetSettings
 from cqn_train.replay.buffer import Replay
 from cqn_train.replay.demonstrations import Demonstrations, load_metadata
 from lerobot_cqn.configuration_cqn import CQNConfig
+from lerobot_cqn.configuration_cqn_as import CQNASConfig
 from lerobot_cqn.errors import ConfigError, DataError
 from lerobot_cqn.modeling_cqn import CQNPolicy
 from lerobot_cqn.schema import Batch, Observation
@@ -38,8 +39,8 @@ def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: make_dataset(folder / name, **kind) for name, kind in KINDS.items()}
 
 
-def make_agent(meta: LeRobotDatasetMetadata, **settings: Any) -> Agent:
-    config = CQNConfig(preset="laptop_state", **SMALL, **settings)
+def make_agent(meta: LeRobotDatasetMetadata, kind: type[CQNConfig] = CQNConfig, **settings: Any) -> Agent:
+    config = kind(preset="laptop_state", **SMALL, **settings)
     policy = make_policy(config, ds_meta=meta)
     return Agent(policy, *make_pre_post_processors(config, dataset_stats=meta.stats))
 
@@ -52,9 +53,9 @@ def loader_batch(root: Path, meta: LeRobotDatasetMetadata, agent: Agent) -> Batc
     return agent.policy.to_batch(agent.preprocessor(torch.utils.data.default_collate(items)))
 
 
-def replay_batch(root: Path, agent: Agent, n_step: int, stack: int) -> Batch:
+def replay_batch(root: Path, agent: Agent, n_step: int, stack: int, sequence: int = 1, fill: str = "mask") -> Batch:
     """The same steps from the replay."""
-    replay = Replay(stack, n_step, agent.policy.config.settings.discount)
+    replay = Replay(stack, n_step, agent.policy.config.settings.discount, sequence=sequence, fill=fill)
     for episode in Demonstrations(DatasetSettings("local/toy", str(root))).episodes(agent):
         replay.add(episode, demo=True)
     places = [(episode, step) for episode, length in enumerate(LENGTHS) for step in range(length)]
@@ -85,6 +86,22 @@ def test_both_ways_give_the_same_transitions(kind: str, stack: int, n_step: int,
     assert torch.equal(loader.demo, replay.demo)
     assert_same(loader.observation, replay.observation)
     assert_same(loader.next_observation, replay.next_observation)
+
+
+@pytest.mark.parametrize("fill", ["zeros", "last", "mask"])
+@pytest.mark.parametrize(("kind", "sequence"), [("rewarded", 1), ("rewarded", 3), ("one_number", 4), ("unrewarded", 9)])
+def test_both_ways_give_the_same_sequences(kind: str, sequence: int, fill: str, datasets: dict[str, Path]) -> None:
+    root = datasets[kind]
+    meta = load_metadata(DatasetSettings("local/toy", str(root)))
+    agent = make_agent(meta, CQNASConfig, action_sequence=sequence, sequence_fill=fill)
+    loader, replay = loader_batch(root, meta, agent), replay_batch(root, agent, 3, 1, sequence, fill)
+    assert loader.action.shape == (sum(LENGTHS), sequence * agent.policy.action_dims)
+    torch.testing.assert_close(loader.action.clamp(-1, 1), replay.action, rtol=0, atol=1e-6)
+    assert (loader.real is None) == (replay.real is None) == (fill != "mask" or sequence == 1)
+    if loader.real is not None and replay.real is not None:
+        assert torch.equal(loader.real, replay.real)
+        inside = sum(min(sequence, length - step) for length in LENGTHS for step in range(length))
+        assert loader.real.sum() == inside * agent.policy.action_dims
 
 
 def test_the_numbers_themselves(datasets: dict[str, Path]) -> None:

@@ -253,7 +253,7 @@ def add_taught(replay: Replay, number: int, flags: list[bool], *, success: bool 
 
 def stores(replay: Replay) -> tuple[set[tuple[int, int]], set[tuple[int, int]]]:
     """Steps (episode, step) in both stores, as sampled; the flag of every row is checked on the way."""
-    demos = bool(len(np.flatnonzero(replay._table()["demo"])))
+    demos = bool(len(np.flatnonzero(replay._table.rows["demo"])))
     batch = replay.sample(2500, 2500 if demos else 0, np.random.default_rng(0))
     places = [locate(batch, row) for row in range(len(batch.action))]
     everything, shown = set(places[:2500]), set(places[2500:])

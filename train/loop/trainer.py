@@ -117,7 +117,7 @@ class Trainer:
                 c.env_steps = before if c.episodes == number else c.env_steps
                 raise
             self._correct()
-            self.updates(self.config.recipe.updates_per_episode, on_update=self._tell_updates)
+            self.updates(self.config.recipe.updates_of_episode(c.env_steps), on_update=self._tell_updates)
             c.online_s += self.clock.now - began - (self.env.waited_s - waited)
             self._look_and_save(before)
 
@@ -153,7 +153,8 @@ class Trainer:
         try:
             with self._background() as agent:
                 while len(recorder) < self.env.max_steps:
-                    action, q = agent.act(prepared, explore=True)
+                    at_random = c.env_steps < self.config.recipe.random_steps
+                    action, q = agent.act(prepared, explore=True, at_random=at_random)
                     outcome = self.env.step(agent.postprocessor(action))
                     executed = agent.carried_out(action, outcome)
                     prepared = agent.prepare(outcome.frame)
@@ -165,7 +166,7 @@ class Trainer:
                         recorder.observe(prepared, outcome.frame)
                         values.append(float(q[0]))
                         c.env_steps += 1
-                        self.updates(self.config.recipe.updates_per_step)
+                        self.updates(self.config.recipe.updates_of_steps(c.env_steps - 1, c.env_steps))
                     if self.should_stop():
                         raise Interrupted
                     if outcome.ended:
@@ -277,8 +278,9 @@ class Trainer:
         # By number: an episode that was discarded at first was stored after later ones.
         for place in sorted(places, key=lambda place: place.number):
             self.metrics.write("episodes", place.note)
-            self.counters.episodes, self.counters.env_steps = place.number + 1, int(place.note["env_steps"])
-            owed += place.length * recipe.updates_per_step + recipe.updates_per_episode
+            before, after = self.counters.env_steps, int(place.note["env_steps"])
+            self.counters.episodes, self.counters.env_steps = place.number + 1, after
+            owed += recipe.updates_of_steps(before, after) + recipe.updates_of_episode(after)
         if places:
             self.monitor.message(
                 f"{len(places)} episodes that ended after the last checkpoint are kept; their {owed} updates are made "

@@ -35,7 +35,15 @@ CURVE, DATASET_CARD = "training/curve.png", "training/dataset_card.md"
 # Settings of a machine: they say nothing to others, and may name people and folders.
 PRIVATE = {("output_dir",), ("dataset", "root"), ("policy", "pretrained_path"), ("policy", "repo_id"), ("resume",),
            ("policy", "push_to_hub"), ("checkpoint_path",), ("job_name",), ("robot", "person")}  # fmt: skip
-RECIPE = ("updates_per_step", "updates_per_episode", "async_updates", "batch_size", "demo_batch_size", "relabel")
+RECIPE = (
+    "updates_per_step",
+    "update_interval",
+    "updates_per_episode",
+    "async_updates",
+    "batch_size",
+    "demo_batch_size",
+    "relabel",
+)
 
 
 @dataclass(frozen=True)

@@ -14,16 +14,17 @@ from numpy.typing import NDArray
 from lerobot_cqn.errors import ConfigError, DataError
 from lerobot_cqn.n_step import n_step_return
 from lerobot_cqn.schema import Batch, Observation
+from lerobot_cqn.sequence import filled
 
 from .damage import find_damage
 from .episode import Episode
 from .files import Journal, Place, Rows, earlier_layout, reserve_all
+from .table import Table
 
 __all__ = ["Replay"]
 
 GIB = 2**30
 BATCHES = 4  # whose pictures are in memory at a time
-SAMPLED = [("start", int), ("length", int), ("terminated", bool), ("demo", bool), ("first", int), ("last", int)]
 
 
 class Replay:
@@ -44,6 +45,8 @@ class Replay:
         folder: Path | None = None,
         capacity_gib: float = 16.0,
         by_step: bool = False,
+        sequence: int = 1,
+        fill: str = "mask",
     ) -> None:
         """An empty replay.
 
@@ -54,9 +57,12 @@ class Replay:
             folder: of its files, which survive a kill; None keeps everything in memory.
             capacity_gib: GiB of all rows together, demonstrations included; > 0.
             by_step: sample uniformly over time steps; else over episodes first, then over their steps.
+            sequence: T >= 1, actions of a sample.
+            fill: what stands for actions beyond an episode's end (`CQNASSettings.sequence_fill`).
         """
         self.frame_stack, self.n_step, self.discount = frame_stack, n_step, discount
         self.folder, self.by_step = folder, by_step
+        self.sequence, self.fill = sequence, fill
         self._capacity_bytes = int(capacity_gib * GIB)
         self._rows: dict[str, Rows] = {}
         self._places: list[Place] = []
@@ -64,7 +70,7 @@ class Replay:
         self._ring = 0  # first row behind them
         self._head = 0  # where the next episode goes
         self._reserved = 0
-        self._sampled: NDArray[Any] | None = None
+        self._sampled: Table | None = None
         self._buffers: dict[tuple[int, str], torch.Tensor] = {}
         self._turn = 0
         self._journal: Journal | None = None
@@ -140,6 +146,7 @@ class Replay:
             number=number,
             note=note or {},
             taught=episode.taught,
+            borders=episode.borders,
         )
         if place.stop > self.capacity:
             raise ConfigError(
@@ -194,7 +201,7 @@ class Replay:
         Their pictures lie in memory that is used again: a batch is good until three more have been sampled.
         Raises DataError when a store that is asked for is empty.
         """
-        return self.transitions(*self._draw(count, demo_count, rng))
+        return self.transitions(*self._table.draw(count, demo_count, rng, by_step=self.by_step))
 
     def batches(self, updates: int, count: int, demo_count: int, rng: np.random.Generator) -> Generator[Batch]:
         """`updates` samples, the next one put together while one is in use; errors surface at the next one.
@@ -208,57 +215,48 @@ class Replay:
                     batch = ahead.result() if ahead is not None else self.sample(count, demo_count, rng)
                     before, ahead = rng.bit_generator.state, None
                     if index + 1 < updates:
-                        ahead = pool.submit(self.transitions, *self._draw(count, demo_count, rng))
+                        drawn = self._table.draw(count, demo_count, rng, by_step=self.by_step)
+                        ahead = pool.submit(self.transitions, *drawn)
                     yield batch
             finally:
                 if ahead is not None:  # drawn, but not used
                     rng.bit_generator.state = before
 
-    def _draw(self, count: int, demo_count: int, rng: np.random.Generator) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Episodes [B] and steps [B]."""
-        table = self._table()
-        everything, demos = np.arange(self.episodes), np.flatnonzero(table["demo"])
-        steps = table["last"] - table["first"]
-        if (count and not len(everything)) or (demo_count and not len(demos)):
-            raise DataError(
-                f"Cannot sample {count} + {demo_count}: the replay holds {len(everything)} episodes, of which "
-                f"{len(demos)} are demonstrations; give a dataset or set the batch size of the empty store to 0."
-            )
-        parts = []
-        for ids, size in ((everything, count), (demos, demo_count)):
-            weights = steps[ids] / steps[ids].sum() if self.by_step and size else None
-            parts += [rng.choice(ids, size, p=weights)] if size else []
-        episode = np.concatenate(parts)
-        return episode, rng.integers(table["first"][episode], table["last"][episode])
-
     def transitions(self, episode: NDArray[Any], step: NDArray[Any]) -> Batch:
         """Transitions at the given steps [B] of the given episodes [B], indices among `places`."""
-        table = self._table()
-        start, length = table["start"][episode], table["length"][episode]
+        rows = self._table.rows
+        start, length = rows["start"][episode], rows["length"][episode]
         window = np.minimum(self.n_step, length - step)  # never past the end of the episode
         ahead = np.minimum(np.arange(self.n_step), window[:, None] - 1)
         rewards = self._rows["reward"].take((start + step)[:, None] + ahead).double()
-        ended = (step + window == length) & table["terminated"][episode]
+        ended = (step + window == length) & rows["terminated"][episode]
         reward, discount = n_step_return(
             rewards, torch.from_numpy(window)[:, None], torch.from_numpy(ended)[:, None], self.discount
         )
+        action, real = self._actions(episode, step)
         return Batch(
             observation=self._observation(start, step),
-            action=self._rows["action"].take(start + step),
+            action=action,
             reward=reward.float(),
             discount=discount.float(),
             next_observation=self._observation(start, step + window),
-            demo=torch.from_numpy(self._shown(episode, step)[:, None].astype(np.float32)),
+            demo=torch.from_numpy(self._table.shown(episode, step)[:, None].astype(np.float32)),
+            real=real,
         )
 
-    def _shown(self, episode: NDArray[Any], step: NDArray[Any]) -> NDArray[Any]:
-        """Whether the steps [B] are of a demonstration, or driven by a person in an episode that is none."""
-        table = self._table()
-        shown: NDArray[Any] = table["demo"][episode]
-        for row in range(self.episodes, len(table)):
-            inside = (table["first"][row] <= step) & (step < table["last"][row])
-            shown = shown | (inside & (table["start"][episode] == table["start"][row]))
-        return shown
+    def _actions(self, episode: NDArray[Any], step: NDArray[Any]) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Sequences [B, T*D] that begin at `step`, and which of their numbers count (`Batch.real`).
+
+        None goes from one driver to another or over a pause: what would lie beyond is filled and never counts.
+        """
+        row = self._table.rows["start"][episode] + step
+        if self.sequence == 1:
+            return self._rows["action"].take(row), None
+        steps, cut = self._table.ahead(episode, step)
+        offsets = np.arange(self.sequence)
+        actions = self._rows["action"].take(row[:, None] + np.minimum(offsets, steps[:, None] - 1))
+        inside = torch.from_numpy(offsets < steps[:, None])
+        return filled(actions, inside, self.fill, torch.from_numpy(cut[:, None]))
 
     def _observation(self, start: NDArray[Any], step: NDArray[Any]) -> Observation:
         """Stacked history that ends at `step`; before the first frame, the first frame is repeated."""
@@ -319,14 +317,11 @@ class Replay:
         self._places.append(place)
         self._sampled = None
 
-    def _table(self) -> NDArray[Any]:
-        """Table that is sampled from: a row for each episode, and behind them one for each span that a person drove."""
+    @property
+    def _table(self) -> Table:
+        """What is sampled from now."""
         if self._sampled is None:
-            rows = [(p.start, p.length, p.terminated, p.demo, 0, p.length) for p in self._places]
-            rows += [
-                (p.start, p.length, p.terminated, True, *span) for p in self._places if not p.demo for span in p.taught
-            ]
-            self._sampled = np.array(rows, dtype=SAMPLED)
+            self._sampled = Table.of(self._places)
         return self._sampled
 
     # -- after a kill ----------------------------------------------------------------------------------------

@@ -16,7 +16,8 @@ class Episode:
     low_dim: float32 [T + 1, P], normalised (None without state); pixels: per view uint8 [T + 1, 3, H, W];
     action: float32 [T, D] in [-1, 1]; reward: float32 [T].
     terminated: the last step really ended the task (success); otherwise time ran out and the last
-    observation's value still counts. taught: the steps (first, one past the last) that a person drove.
+    observation's value still counts. taught: the steps (first, one past the last) that a person drove; borders: steps
+    before which a pause lay.
     """
 
     low_dim: NDArray[Any] | None
@@ -26,6 +27,7 @@ class Episode:
     terminated: bool
     success: bool
     taught: tuple[tuple[int, int], ...] = ()
+    borders: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         """Steps, T."""

@@ -28,7 +28,8 @@ class Place:
     """Place of an episode of T steps in the rows, with what it is.
 
     start: first of its T + 1 rows; number: how many episodes the run had before it; note: what the run wants to know of
-    it after a kill (its row of episodes.csv); taught: the steps (first, one past the last) that a person drove.
+    it after a kill (its row of episodes.csv); taught: the steps (first, one past the last) that a person drove;
+    borders: steps before which a pause lay.
     """
 
     start: int
@@ -39,6 +40,7 @@ class Place:
     number: int = -1
     note: dict[str, Any] = field(default_factory=dict)
     taught: tuple[tuple[int, int], ...] = ()
+    borders: tuple[int, ...] = ()
 
     @property
     def stop(self) -> int:
@@ -47,7 +49,8 @@ class Place:
 
 
 def _place(entry: dict[str, Any]) -> Place:
-    return Place(**{**entry, "taught": tuple((first, last) for first, last in entry.get("taught", ()))})
+    taught = tuple((first, last) for first, last in entry.get("taught", ()))
+    return Place(**{**entry, "taught": taught, "borders": tuple(entry.get("borders", ()))})
 
 
 class Rows:

@@ -24,6 +24,7 @@ class Recorder:
     action: list[NDArray[Any]] = field(default_factory=list)
     reward: list[float] = field(default_factory=list)
     taught: list[bool] = field(default_factory=list)
+    borders: set[int] = field(default_factory=set)
 
     def __len__(self) -> int:
         """Steps so far."""
@@ -37,7 +38,8 @@ class Recorder:
         self.pixels.append(self.agent.pixels(prepared, given))
 
     def retake(self, prepared: Frame, given: Frame, reward: float) -> None:
-        """Keep a frame in place of the last one, and a reward for the step that led to it."""
+        """Keep a frame in place of the last one, and a reward for the step that led to it: a pause lies before it."""
+        self.borders.add(len(self))
         if self.low_dim:
             self.low_dim.pop()
         self.pixels.pop()
@@ -61,6 +63,7 @@ class Recorder:
             terminated=terminated,
             success=success,
             taught=_spans(self.taught),
+            borders=tuple(sorted(self.borders - {0, len(self)})),
         )
 
 
