@@ -14,8 +14,9 @@ from typing import Any, Protocol
 from lerobot_cqn.errors import ConfigError, DataError
 
 from .disk.folders import local_root, refuse_existing
+from .human_hand import Hand, HumanOperator, moving_dims
 from .terminal.console import Interrupted, load_lerobot, note, progress, result
-from .terminal.options import help_page, option, parse, parse_choice, with_plugins
+from .terminal.options import help_page, option, parse_all, parse_choice, with_plugins
 
 __all__ = ["RecordConfig", "ScriptedTeleoperator", "help", "main", "record_dataset"]
 
@@ -44,6 +45,9 @@ class RecordConfig:
     pause_share: float = option(0.45, help="Share of time steps in which the teleoperator pauses, 0 to below 1.")
     tremor_rad: float = option(
         0.0, help="Standard deviation of a trembling hand's noise on each joint action, rad a step; in pauses too."
+    )
+    human: bool = option(
+        False, help="Move as a person's hand does: late, too far, unsteady, each time another way (options below)."
     )
     max_steps: int | None = option(
         None, help="An attempt that takes longer has failed; by default the environment's limit."
@@ -79,23 +83,26 @@ class ScriptedTeleoperator(Protocol):
 
 def help(summary: str) -> str:
     """Help page."""
-    return help_page("cqn-data record", summary, RecordConfig, EXAMPLE, NOTES)
+    return help_page("cqn-data record", summary, (RecordConfig, Hand), EXAMPLE, NOTES)
 
 
 def main(args: list[str]) -> None:
     """Run from the command line; errors as in :func:`record_dataset`."""
-    config = parse(RecordConfig, [a for a in args if not a.startswith("--env.")])
+    config, hand = parse_all((RecordConfig, Hand), [a for a in args if not a.startswith("--env.")])
     config.validate()
+    if hand != Hand() and not config.human:
+        raise ConfigError("The habits of a hand (--reaction_s, --overshoot, …) need --human=true.")
     load_lerobot()
-    record_dataset(config, env_config([a for a in args if a.startswith("--env.")]))
+    record_dataset(config, env_config([a for a in args if a.startswith("--env.")]), hand)
 
 
-def record_dataset(config: RecordConfig, env_config: Any) -> None:
+def record_dataset(config: RecordConfig, env_config: Any, hand: Hand | None = None) -> None:
     """Record and report.
 
     Args:
         config: what to record.
         env_config: a LeRobot ``EnvConfig``.
+        hand: habits of the hand with ``human``; None: the usual ones.
 
     Raises:
         ConfigError: a setting out of range, or an environment without a scripted teleoperator.
@@ -109,8 +116,9 @@ def record_dataset(config: RecordConfig, env_config: Any) -> None:
     root = local_root(config.repo_id, config.root)
     refuse_existing(root)
     with _environment(env_config) as env:
-        teleoperator = _teleoperator(env, env_config, config)
-        session = _Session(env, teleoperator, config, task=_task(env, env_config))
+        hand = hand or Hand()
+        teleoperator = _teleoperator(env, env_config, config, hand)
+        session = _Session(env, teleoperator, config, task=_task(env, env_config), hand=hand)
         features = session.features()
         writer = new_dataset(
             config.repo_id, root, fps=int(env_config.fps), features=features, robot_type=str(env_config.type)
@@ -129,8 +137,11 @@ def record_dataset(config: RecordConfig, env_config: Any) -> None:
 class _Session:
     """One recording: attempts until enough succeeded, it was stopped, or too many failed."""
 
-    def __init__(self, env: Any, teleoperator: ScriptedTeleoperator, config: RecordConfig, task: str) -> None:
+    def __init__(
+        self, env: Any, teleoperator: ScriptedTeleoperator, config: RecordConfig, task: str, hand: Hand
+    ) -> None:
         self.env, self.teleoperator, self.config, self.task = env, teleoperator, config, task
+        self.hand = hand
         self.failures = 0
         self._stop_asked = False
         self.gave_up = False
@@ -218,6 +229,7 @@ class _Session:
     def entry(self) -> dict[str, Any]:
         """Entry of the history: settings, and what the actions are where the environment says it."""
         settings = {k: v for k, v in vars(self.config).items() if k not in ("repo_id", "root") and v is not None}
+        settings |= vars(self.hand) if self.config.human else {}
         entry = {"operation": "record", "target": self.config.repo_id, "settings": settings, "told": told(settings)}
         plain = self.env.unwrapped
         kind = getattr(plain, "action_kind", None)
@@ -237,7 +249,8 @@ class _Session:
 def told(settings: Mapping[str, Any]) -> str:
     """The sentence for the history, from the settings of a recording."""
     said = f"Recorded scripted demonstrations in an environment until {settings['episodes']} had succeeded"
-    return f"{said}; the script pauses in {settings['pause_share']:.0%} of the time steps."
+    hand = " and moves as a person's hand does" if settings.get("human") else ""
+    return f"{said}; the script pauses in {settings['pause_share']:.0%} of the time steps{hand}."
 
 
 def _columns(observation: dict[str, Any]) -> dict[str, Any]:
@@ -294,8 +307,7 @@ def _environment(env_config: Any) -> Iterator[Any]:
         vector.close()
 
 
-def _teleoperator(env: Any, env_config: Any, config: RecordConfig) -> ScriptedTeleoperator:
-
+def _teleoperator(env: Any, env_config: Any, config: RecordConfig, hand: Hand) -> ScriptedTeleoperator:
     make = getattr(env.unwrapped, "scripted_teleoperator", None)
     if make is None:
         raise ConfigError(
@@ -306,7 +318,14 @@ def _teleoperator(env: Any, env_config: Any, config: RecordConfig) -> ScriptedTe
     if tremor and "tremor_rad" not in inspect.signature(make).parameters:
         raise ConfigError(f"The teleoperator of '{env_config.type}' cannot tremble; leave --tremor_rad out.")
     teleoperator: ScriptedTeleoperator = make(pause_share=config.pause_share, seed=config.seed, **tremor)
-    return teleoperator
+    if not config.human:
+        return teleoperator
+    space = env.action_space
+    names = [str(name) for name in getattr(env.unwrapped, "action_names", None) or map(str, range(space.shape[0]))]
+    moving = moving_dims(names, space.low, space.high)
+    if not len(moving):
+        raise ConfigError(f"The actions of '{env_config.type}' are no movements ({names}); leave --human out.")
+    return HumanOperator(teleoperator, hand, moving, space.high[moving], int(env_config.fps))
 
 
 @contextlib.contextmanager

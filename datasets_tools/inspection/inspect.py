@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .finding import Finding
     from .history import History
     from .numbers import Numbers
+    from .sequences import Sequences
 
 __all__ = ["InspectConfig", "Inspection", "help", "inspect_dataset", "main"]
 
@@ -53,6 +54,9 @@ class InspectConfig:
         None, help=f"Write the page to this file, which must not exist; by default {PAGE}, with --json none."
     )
     json: bool = option(False, help="Print one JSON object to stdout, and nothing else.")
+    value_probe: bool = option(
+        False, help="Also fit the return on one action and on several: which of CQN and CQN-AS suits; some seconds."
+    )
     strict: bool = option(False, help="Exit with code 1 where there is an error.")
 
     @property
@@ -73,6 +77,7 @@ class Inspection:
     numbers: "Numbers | None" = None
     cameras: "Sequence[CameraLook]" = ()
     history: "History | None" = None
+    sequences: "Sequences | None" = None
 
     @property
     def ok(self) -> bool:
@@ -111,7 +116,7 @@ def main(args: list[str]) -> int:
             raise
         note(str(error))
         return 1
-    inspection = inspect_dataset(config.repo_id, source)
+    inspection = inspect_dataset(config.repo_id, source, value_probe=config.value_probe)
     if page is not None:
         try:
             _write_page(page, inspection)
@@ -129,8 +134,11 @@ def main(args: list[str]) -> int:
     return int(config.strict and not inspection.ok)
 
 
-def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
-    """Measure and judge; what is damaged becomes a finding, and the rest is looked at all the same."""
+def inspect_dataset(repo_id: str, source: "Source", *, value_probe: bool = False) -> Inspection:
+    """Measure and judge; what is damaged becomes a finding, and the rest is looked at all the same.
+
+    value_probe: compare action sequences, too.
+    """
     import numpy as np
 
     from .cameras import look, missing_videos
@@ -139,6 +147,7 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
     from .history import history_finding, measure_history
     from .numbers import measure
     from .places import order, timing
+    from .sequences import measure_sequences, sequence_finding
     from .statistics import statistics
 
     missing = missing_videos(source)
@@ -159,6 +168,9 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
         line = bar.add_task("Comparing histories", total=1)
         history = measure_history(source, numbers)
         bar.advance(line)
+        sequences = measure_sequences(source, numbers) if value_probe else None
+    if value_probe and sequences is None:
+        note("Sequences cannot be compared: too few episodes of more than 16 steps, or all of one length.")
     try:
         deltas = source.deltas is not None
     except Exception:  # a damaged history is not what is inspected here
@@ -170,8 +182,9 @@ def inspect_dataset(repo_id: str, source: "Source") -> Inspection:
         *order(source),
         *timing(source, numbers),
         *history_finding(history),
+        *sequence_finding(sequences),
     ]
-    return Inspection(sorted(found, key=by_level), dataset, numbers, cameras, history)
+    return Inspection(sorted(found, key=by_level), dataset, numbers, cameras, history, sequences)
 
 
 def _write_page(path: Path, inspection: Inspection) -> None:
@@ -180,7 +193,8 @@ def _write_page(path: Path, inspection: Inspection) -> None:
 
     if inspection.dataset is None or inspection.numbers is None:
         return
-    text = page(inspection.dataset, inspection.numbers, inspection.cameras, inspection.findings, inspection.history)
+    probes = (inspection.history, inspection.sequences)
+    text = page(inspection.dataset, inspection.numbers, inspection.cameras, inspection.findings, *probes)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with path.open("x", encoding="utf-8") as file:
@@ -203,9 +217,8 @@ def _show(inspection: Inspection) -> None:
     if found is not None and found.steps:
         result(f"Threshold {found.threshold:g}: {found.reason}")
         result("Still steps at " + ", ".join(f"{a.threshold:g}: {a.share:.0%}" for a in found.alternatives))
-    for line in filter(
-        None, [sentence_of_actions(numbers), inspection.history.sentence() if inspection.history else None]
-    ):
+    probes = [probe.sentence() for probe in (inspection.history, inspection.sequences) if probe is not None]
+    for line in filter(None, [sentence_of_actions(numbers), *probes]):
         result(line)
     needed = memory(numbers, inspection.cameras)
     pictures = (
@@ -302,6 +315,17 @@ def as_json(repo_id: str, inspection: Inspection) -> dict[str, Any]:
                 }
                 for (f, s), shares in inspection.history.shares.items()
             ],
+        },
+        "sequences": None
+        if inspection.sequences is None
+        else {
+            "advised_actions": inspection.sequences.advised,
+            "told": inspection.sequences.told,
+            "steps": inspection.sequences.steps,
+            "unexplained": [
+                {"actions": n, "share": _round(share)} for n, share in inspection.sequences.unexplained.items()
+            ],
+            "noise": {name: _round(share) for name, share in inspection.sequences.noise.items()},
         },
         "episodes": [
             {

@@ -12,6 +12,7 @@ from .checks import PAPER_SIZE, Dataset, memory
 from .finding import LEVELS, Finding
 from .history import FRAMES, STRIDES, History
 from .numbers import Dimension, EpisodeNumbers, Numbers
+from .sequences import Sequences
 from .svg import pauses, spark, still_share, threshold_histogram
 
 __all__ = ["page", "sentence_of_actions", "size_text", "verdict"]
@@ -69,6 +70,7 @@ def page(
     cameras: Sequence[CameraLook],
     found: Sequence[Finding],
     history: History | None = None,
+    sequences: Sequences | None = None,
 ) -> str:
     """The whole document; every name from the dataset is escaped."""
     name = html.escape(dataset.repo_id)
@@ -81,6 +83,7 @@ def page(
         _episodes(dataset, numbers),
         _dimensions(numbers),
         _history(history),
+        _sequences(sequences),
         _cameras(cameras),
         _memory(numbers, cameras),
     ]
@@ -238,6 +241,18 @@ def _history(history: History | None) -> str:
     )
     return (
         f"<h2>History</h2><p class='soft'>{html.escape(note)}</p><div class='scroll'><table>{head}{rows}</table></div>"
+    )
+
+
+def _sequences(sequences: Sequences | None) -> str:
+    if sequences is None:
+        return ""
+    shares = "".join(_row([n, f"{share:.1%}"]) for n, share in sequences.unexplained.items())
+    noise = "".join(_row([name, f"{share:.0%}"]) for name, share in sequences.noise.items())
+    return (
+        f"<h2>Action sequences</h2><p class='soft'>{html.escape(sequences.sentence())}</p><div class='pair'>"
+        f"<table><tr><th>actions</th><th>return left unexplained</th></tr>{shares}</table>"
+        f"<table><tr><th>action</th><th>noise from step to step</th></tr>{noise}</table></div>"
     )
 
 

@@ -22,7 +22,7 @@ ROOM_MAY_USE: dict[str, tuple[str, ...]] = {
     "lerobot_cqn._plugin": ("train.envs", "train.sim_arm"),
     "datasets_tools": tuple(
         f"lerobot_cqn.{name}"
-        for name in ["errors", "schema", "delta_actions", "hub_retry", "history_text", "scaling_check"]
+        for name in ["errors", "ranges", "schema", "delta_actions", "hub_retry", "history_text", "scaling_check"]
     ),
     "train": ("lerobot_cqn", "datasets_tools"),
 }
@@ -39,7 +39,9 @@ FLOORS: dict[str, str] = {
         "configuration_cqn|configuration_drqv2 configuration_cqn_as "
         "processor_cqn|processor_cqn_as|processor_drqv2 modeling_cqn|modeling_cqn_as|modeling_drqv2"
     ),
-    "datasets_tools": "terminal decisions|web views disk hub operations formats|inspection|review record|cli",
+    "datasets_tools": (
+        "terminal decisions|web views disk hub operations formats|inspection|review human_hand record|cli"
+    ),
     "train": (
         "interfaces|clock envs|robot|operator sim_arm|config agent replay run loop arm "
         "push|arguments build cli|bench|demo"

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from cqn_data.inspection.history import FRAMES, STRIDES, History, history_finding, stacked, unexplained
+from cqn_data.inspection.history import FRAMES, STRIDES, History, history_finding, stacked
+from cqn_data.inspection.regression import unexplained
 
 EPISODES, STEPS = 8, 60
 
