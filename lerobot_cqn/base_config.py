@@ -39,6 +39,10 @@ class RLConfig(PreTrainedConfig):
     bound_margin: float | None = None
     # Networks
     encoder_channels: tuple[int, ...] | None = None
+    encoder_strides: tuple[int, ...] | None = None
+    encoder_kernel: int | None = None
+    encoder_padding: int | None = None
+    encoder_norm: str | None = None
     feature_dim: int | None = None
     hidden_dim: int | None = None
     # Value distribution

@@ -17,8 +17,9 @@ class CQNConfig(RLConfig):
     """Coarse-to-fine Q-Network (Seo, Uruç, James 2024).
 
     `preset` names a column of published numbers (paper_rlbench, paper_real_world, paper_dmc_state,
-    paper_dmc_pixels, reference_rlbench) or one of ours (laptop_state, laptop_pixels); every field left at
-    None takes the preset's value, every field given replaces it. Read the result from `settings`.
+    paper_dmc_pixels), the authors' code (reference_rlbench, reference_dmc_state, reference_dmc_pixels) or one of ours
+    (laptop_state, laptop_pixels, practice_state); every field left at None takes the preset's value, every field given
+    replaces it. Read the result from `settings`.
     Meaning, range and source of each number: `lerobot_cqn/settings.py`.
 
     Raises ConfigError for an unknown preset or a value out of range.
@@ -32,6 +33,7 @@ class CQNConfig(RLConfig):
     # Losses
     bc_dominance: bool | None = None
     bc_margin: float | None = None
+    centralized_target: bool | None = None
     centralized_critic: bool | None = None
     next_action_from: str | None = None
     # Acting

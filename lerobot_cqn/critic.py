@@ -125,8 +125,12 @@ class CQNModel(Model):
         s = self.settings
         action, q = self.choose(observation, explore)
         if explore and s.exploration_noise > 0:
-            action = snap(action + s.exploration_noise * torch.randn_like(action), s.levels, s.bins)
+            action = self.executable(action + s.exploration_noise * torch.randn_like(action))
         return action, q
+
+    def executable(self, action: Tensor) -> Tensor:
+        """The nearest representable action."""
+        return snap(action, self.settings.levels, self.settings.bins)
 
     # -- learning ------------------------------------------------------------------------------------------
 
@@ -148,6 +152,11 @@ class CQNModel(Model):
             return reward[..., None] + discount[..., None] * logits[..., 0]
         return project_onto_support(F.softmax(logits, dim=-1), reward, discount, self.support)
 
+    def _by_step(self, values: Tensor) -> Tensor:
+        """[B, L, T*D, ...] -> [B, L, T, D, ...], T = 1 without sequences."""
+        shape = self.critic.shape
+        return values.view(*values.shape[:2], shape.sequence or 1, shape.dims, *values.shape[3:])
+
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of Algorithm 2 and its parts (detached scalars) for an already augmented batch."""
         s = self.settings
@@ -161,11 +170,13 @@ class CQNModel(Model):
                 target = self.td_target(self.encode(batch.next_observation), batch.reward, batch.discount)
             taken = take_bin(logits, indices)[..., 0, :]
             counts = real
+            if s.centralized_target:
+                by_step = self._by_step(target)
+                target = by_step.mean(3, keepdim=True).expand_as(by_step).flatten(2, 3)
             if s.centralized_critic:  # the mean over D of each step: [B, L, T, A]
-                split = (self.critic.shape.sequence or 1, self.critic.shape.dims)
-                taken, target = (x.view(*x.shape[:2], *split, *x.shape[3:]) for x in (taken, target))
+                taken, target = self._by_step(taken), self._by_step(target).mean(3)
                 taken = mean_log_probs(taken) if s.distributional else taken.mean(3)
-                target, counts = target.mean(3), None if real is None else real[:, :: split[1]]
+                counts = None if real is None else real[:, :: self.critic.shape.dims]
             if s.distributional:
                 rl = q_learning_loss(taken, target, counts).mean()
             else:

@@ -32,10 +32,14 @@ class Model(nn.Module):
     def __init__(self, views: Mapping[str, tuple[int, int, int]], settings: CommonSettings, *, plain: bool) -> None:
         super().__init__()
         self.settings = settings
+        s = settings
         encoders = [
-            ViewEncoder(c * settings.frame_stack, height, width, settings.encoder_channels, plain=plain)
+            ViewEncoder(
+                c * s.frame_stack, height, width, s.encoder_channels, strides=s.encoder_strides,
+                kernel=s.encoder_kernel, padding=s.encoder_padding, norm=s.encoder_norm, plain=plain,
+            )
             for c, height, width in views.values()
-        ]
+        ]  # fmt: skip
         self.encoders = nn.ModuleList(encoders)
         self.pixel_size = sum(encoder.out_features for encoder in encoders)
         values = support(settings.v_min, settings.v_max, settings.critic_atoms)
@@ -48,6 +52,10 @@ class Model(nn.Module):
     def act(self, observation: Observation, explore: bool = False) -> tuple[Tensor, Tensor]:
         """Action [B, D] in [-1, 1] and its Q [B]."""
         raise NotImplementedError
+
+    def executable(self, action: Tensor) -> Tensor:
+        """The action nearest to one [B, D] in [-1, 1] that the method itself could choose."""
+        return action
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss and its parts (detached scalars) for an already augmented batch."""

@@ -23,38 +23,59 @@ __all__ = [
     "zero_head",
 ]
 
-# Kernel, stride and padding of every convolution (table 2; the kernel is the authors' choice).
-KERNEL, STRIDE, PADDING = 4, 2, 1
+STRIDE = 2  # of a convolution where none is given (table 2)
 LAYER_NORM_EPS = 1e-5
 
 
 class ViewEncoder(nn.Module):
     """Convolutions with layer norm over the channels at each pixel and SiLU, for one camera view.
 
-    plain: ReLU and no norm instead, as in DrQ-v2.
+    strides: of each convolution, empty: 2 each; norm: over the "channels" at each pixel, or over the whole "picture"
+    (group norm of one group). plain: ReLU and no norm instead, as in DrQ-v2.
     """
 
-    def __init__(self, in_channels: int, height: int, width: int, channels: Sequence[int], plain: bool = False) -> None:
+    def __init__(
+        self,
+        in_channels: int,
+        height: int,
+        width: int,
+        channels: Sequence[int],
+        *,
+        strides: Sequence[int] = (),
+        kernel: int = 4,
+        padding: int = 1,
+        norm: str = "channels",
+        plain: bool = False,
+    ) -> None:
         super().__init__()
-        self.plain = plain
-        sizes = [in_channels, *channels]
-        self.convolutions = nn.ModuleList(nn.Conv2d(a, b, KERNEL, STRIDE, PADDING) for a, b in pairwise(sizes))
-        self.norms = nn.ModuleList(nn.Identity() if plain else nn.LayerNorm(c, eps=LAYER_NORM_EPS) for c in channels)
-        for _ in channels:
-            height, width = (
-                (height + 2 * PADDING - KERNEL) // STRIDE + 1,
-                (width + 2 * PADDING - KERNEL) // STRIDE + 1,
-            )
+        self.plain, self.whole = plain, norm == "picture"
+        sizes, strides = [in_channels, *channels], strides or [STRIDE] * len(channels)
+        self.convolutions = nn.ModuleList(
+            nn.Conv2d(a, b, kernel, stride, padding) for (a, b), stride in zip(pairwise(sizes), strides, strict=True)
+        )
+        self.norms = nn.ModuleList(self._norm(count) for count in channels)
+        given = f"{height} x {width}"
+        for stride in strides:
+            height, width = ((size + 2 * padding - kernel) // stride + 1 for size in (height, width))
         if min(height, width) < 1:
             raise ConfigError(
-                f"Images are too small for {len(channels)} convolutions of stride {STRIDE}: expected at least "
-                f"{STRIDE ** len(channels)} pixels a side; resize them or shorten `encoder_channels`."
+                f"Images of {given} pixels are too small for {len(channels)} convolutions of strides {[*strides]}: "
+                "resize them, or shorten `encoder_channels`."
             )
         self.out_features = channels[-1] * height * width
+
+    def _norm(self, channels: int) -> nn.Module:
+        if self.plain:
+            return nn.Identity()
+        whole = nn.GroupNorm(1, channels, eps=LAYER_NORM_EPS)
+        return whole if self.whole else nn.LayerNorm(channels, eps=LAYER_NORM_EPS)
 
     def forward(self, pixels: Tensor) -> Tensor:
         """[B, 3*S, H, W] float in [-0.5, 0.5] -> [B, out_features]."""
         for convolution, norm in zip(self.convolutions, self.norms, strict=True):
+            if self.whole and not self.plain:
+                pixels = F.silu(norm(convolution(pixels)))
+                continue
             # Layer norm over the last axis of the channels-last view: no copy when memory is channels-last.
             features = norm(convolution(pixels).permute(0, 2, 3, 1))
             activate = F.relu if self.plain else F.silu

@@ -31,6 +31,10 @@ class CQNASModel(CQNModel):
         """Greedy sequence [B, T*D] in [-1, 1] and its mean Q [B]; noise is added to the one action of a step, later."""
         return self.choose(observation, explore)
 
+    def executable(self, action: Tensor) -> Tensor:
+        """Any action: the mean of several sequences is on no grid."""
+        return action
+
     def steps(self, sequence: Tensor) -> Tensor:
         """Sequence [B, T*D] as the actions of its steps, [B, T, D]."""
         return sequence.view(len(sequence), self.settings.action_sequence, -1)

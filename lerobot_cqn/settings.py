@@ -37,7 +37,11 @@ class CommonSettings:
     action_margin: float = number(0.0, least=0)  # widens the action bounds by this share of the range, on each side
     bound_margin: float = number(0.0, least=0)  # the same by this share of each bound's own absolute value
     # Networks
-    encoder_channels: tuple[int, ...] = (32, 64, 128, 256)  # of each convolution, stride 2; one encoder a camera
+    encoder_channels: tuple[int, ...] = (32, 64, 128, 256)  # of each convolution; one encoder a camera
+    encoder_strides: tuple[int, ...] = ()  # of each convolution; empty: 2 each
+    encoder_kernel: int = number(4, least=1, most=16)  # pixels a side of each convolution
+    encoder_padding: int = number(1, least=0, most=8)  # pixels of zeros around what each convolution gets
+    encoder_norm: str = "channels"  # layer norm over the channels at each pixel, or over the whole "picture"
     feature_dim: int = number(64, least=1)  # size of the projections of pictures and of numbers, before the trunk
     hidden_dim: int = number(512, least=1)  # width of the trunk
     # Value distribution
@@ -73,6 +77,15 @@ class CommonSettings:
             raise ConfigError(f"`v_min` must be below `v_max`, got {self.v_min} and {self.v_max}.")
         if not self.encoder_channels or min(self.encoder_channels) < 1:
             raise ConfigError(f"`encoder_channels` must be positive numbers, got {self.encoder_channels}.")
+        if self.encoder_strides and (
+            len(self.encoder_strides) != len(self.encoder_channels) or min(self.encoder_strides) < 1
+        ):
+            raise ConfigError(
+                f"`encoder_strides` must be a positive number for each of {self.encoder_channels}, or empty, got "
+                f"{self.encoder_strides}."
+            )
+        if self.encoder_norm not in (norms := ("channels", "picture")):
+            raise ConfigError(one_of("value of `encoder_norm`", self.encoder_norm, norms))
         if self.rl_loss_scale == 0 and self.bc_loss_scale == 0:
             raise ConfigError("Nothing to learn: `rl_loss_scale` and `bc_loss_scale` are both 0; set one above 0.")
 
@@ -92,6 +105,7 @@ class CQNSettings(CommonSettings):
     # Losses; rl_loss_scale=0 gives the paper's CBC baseline, distributional=False also margin-only imitation
     bc_dominance: bool = True  # False: margin only
     bc_margin: float = number(0.01, least=0)  # the authors' implementation; the paper gives no number
+    centralized_target: bool = False  # True: every dimension is pulled to the mean over D of the targets (robobase's)
     centralized_critic: bool = False  # True: one value for the whole action, the mean over D (an ablation of the paper)
     next_action_from: str = "online"  # the authors' double-Q style; "target" is equation 2 as written
     # Acting
@@ -170,6 +184,28 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper_dmc_pixels": {**_DMC, "frame_stack": 3},
     # The authors' implementation where it differs from the paper (docs/algorithm.md).
     "reference_rlbench": {"n_step": 1, "v_min": -2.0, "v_max": 2.0, "bound_margin": 0.2},
+    # The authors' code for DeepMind Control: Adam without decay, the online critic acts, another encoder; an update in
+    # two steps after 2,000 uniform ones (`Recipe`). For states, which it has not: the same with scalar values.
+    "reference_dmc_pixels": {
+        **_DMC,
+        "frame_stack": 3,
+        "lr": 1e-4,
+        "weight_decay": 0.0,
+        "act_with": "online",
+        "encoder_channels": (32, 32, 32, 32),
+        "encoder_strides": (2, 1, 1, 1),
+        "encoder_kernel": 3,
+        "encoder_padding": 0,
+        "encoder_norm": "picture",
+    },
+    "reference_dmc_state": {
+        **_DMC,
+        "frame_stack": 1,
+        "lr": 1e-4,
+        "weight_decay": 0.0,
+        "act_with": "online",
+        "distributional": False,
+    },
     # Ours: joints and object poses, no camera, a laptop. Small network, one frame, larger steps.
     "laptop_state": {"frame_stack": 1, "hidden_dim": 256, "lr": 3e-4},
     # Ours: two small cameras on a laptop or one GPU.
@@ -228,6 +264,5 @@ def resolve[S: CommonSettings](
         raise ConfigError(one_of("preset", preset, presets))
     names = {field.name for field in fields(kind)}
     given = {name: value for name, value in overrides.items() if value is not None and name in names}
-    if "encoder_channels" in given:
-        given["encoder_channels"] = tuple(given["encoder_channels"])
+    given |= {name: tuple(given[name]) for name in ("encoder_channels", "encoder_strides") if name in given}
     return replace(kind(**presets[preset]), **given)

@@ -87,7 +87,7 @@ class Agent:
         """
         action, q = self.policy.act(prepared, explore=explore)
         if at_random:
-            action = 2 * torch.rand_like(action) - 1
+            action = self.policy.model.executable(2 * torch.rand_like(action) - 1)
         return action, q.float().cpu().numpy()
 
     def low_dim(self, prepared: Frame) -> NDArray[Any] | None:

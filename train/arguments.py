@@ -59,6 +59,8 @@ PRESETS: dict[str, dict[str, str]] = {
         "paper_dmc_state": "the appendix on DeepMind Control, state, no demonstrations",
         "paper_dmc_pixels": "the same, one camera",
         "reference_rlbench": "the authors' implementation where it differs from the paper",
+        "reference_dmc_state": "the authors' code for DeepMind Control, state: scalar values, uniform actions first",
+        "reference_dmc_pixels": "the same, one camera",
         "laptop_state": "ours: joints and object poses, small network, minutes on one core",
         "laptop_pixels": "ours: two small cameras, a laptop or one GPU",
         "practice_state": "ours: laptop_state with history and more weight on RL, for long practice",

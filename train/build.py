@@ -254,7 +254,7 @@ def make_replay(run: ValidRun) -> Replay:
     sequences = (s.action_sequence, s.sequence_fill) if isinstance(s, CQNASSettings) else (1, "mask")
     return Replay(
         s.frame_stack, s.n_step, s.discount, folder=run.output_dir / "replay", capacity_gib=replay.capacity_gib,
-        by_step=replay.sampling == "steps", sequence=sequences[0], fill=sequences[1],
+        by_step=replay.sampling == "steps", full_windows=replay.full_windows, sequence=sequences[0], fill=sequences[1],
     )  # fmt: skip
 
 

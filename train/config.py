@@ -57,6 +57,10 @@ _RECIPES: dict[str, Recipe] = {
     "paper_real_world": Recipe(updates_per_step=0, updates_per_episode=50),
     "paper_dmc_state": Recipe(batch_size=512, demo_batch_size=0, action_bounds="environment"),
     "paper_dmc_pixels": Recipe(demo_batch_size=0, action_bounds="environment"),
+    "reference_dmc_state": Recipe(update_interval=2, demo_batch_size=0, random_steps=2000, action_bounds="environment"),
+    "reference_dmc_pixels": Recipe(
+        update_interval=2, demo_batch_size=0, random_steps=2000, action_bounds="environment"
+    ),
     "laptop_state": Recipe(batch_size=64, demo_batch_size=64),
     "laptop_pixels": Recipe(updates_per_step=0, updates_per_episode=25, batch_size=64, demo_batch_size=64),
     "practice_state": Recipe(updates_per_step=0, updates_per_episode=25, batch_size=64, demo_batch_size=64),
@@ -102,6 +106,7 @@ class ReplaySettings:
     # of the demonstrations and the run's episodes together; the oldest make room
     capacity_gib: float = number(16.0, above=0)
     accept_loss: bool = False  # go on with --resume where episodes of the replay are damaged or gone
+    full_windows: bool = False  # start no n-step window that the episode's end would shorten, as the reference
     sampling: str = "episodes"  # uniform over episodes, then over their steps (the reference's); or over "steps"
 
 

@@ -41,6 +41,7 @@ p { margin: .4rem 0; } .soft, figcaption { color: var(--soft); font-size: .9rem;
 .tag { font-size: .78rem; font-weight: 600; color: var(--note); text-transform: uppercase; margin-right: .5rem; }
 .error .tag { color: var(--error); } .warning .tag { color: var(--warning); }
 .pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(20rem, 100%), 1fr)); gap: 1.5rem; }
+.pair { align-items: start; }
 .pair > *, figure { min-width: 0; margin: 0; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .92rem; width: 100%; overflow-wrap: normal; }

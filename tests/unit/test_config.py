@@ -50,6 +50,9 @@ def test_presets_are_the_defaults_with_their_column_on_top(preset: str) -> None:
         ("paper_real_world", {"frame_stack": 4, "levels": 4, "bins": 3, "rl_loss_scale": 0.1, "shift_pixels": 4}),
         ("paper_dmc_state", {"frame_stack": 1, "v_min": 0, "v_max": 200, "exploration_noise": 0.1}),
         ("paper_dmc_pixels", {"frame_stack": 3, "bc_loss_scale": 0, "rl_loss_scale": 1}),
+        ("reference_dmc_pixels", {"frame_stack": 3, "lr": 1e-4, "weight_decay": 0, "act_with": "online", "atoms": 51}),
+        ("reference_dmc_pixels", {"encoder_kernel": 3, "encoder_norm": "picture", "v_max": 200, "n_step": 3}),
+        ("reference_dmc_state", {"distributional": False, "exploration_noise": 0.1, "tau": 0.02, "lr": 1e-4}),
         (
             "reference_rlbench",
             {"n_step": 1, "v_min": -2, "v_max": 2, "bound_margin": 0.2, "action_margin": 0, "frame_stack": 8},
@@ -176,6 +179,9 @@ def test_the_recipe_follows_the_policys_preset() -> None:
     assert mixed == Recipe(
         updates_per_step=2, updates_per_episode=50, batch_size=8, demo_batch_size=256, relabel=False
     )  # fmt: skip
+    for kind in ("state", "pixels"):
+        dmc = recipe(f"--policy.preset=reference_dmc_{kind}")
+        assert (dmc.update_interval, dmc.random_steps, dmc.batch_size, dmc.demo_batch_size) == (2, 2000, 256, 0)
     # The paper's last table: DrQ-v2+ has the recipes of CQN, DrQ-v2 has not.
     assert recipe(policy="drqv2") == Recipe()
     plain = recipe("--policy.preset=drqv2", policy="drqv2")

@@ -5,14 +5,16 @@ from dataclasses import replace
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from lerobot_cqn.critic import CQNModel
 from lerobot_cqn.discretisation import encode, snap
+from lerobot_cqn.errors import ConfigError
 from lerobot_cqn.learner import Learner, NonFiniteLossError
 from lerobot_cqn.losses import margin_loss, take_bin
 from lerobot_cqn.schema import Batch, Observation
-from lerobot_cqn.settings import CQNSettings
+from lerobot_cqn.settings import PRESETS, CQNSettings, resolve
 
 from .test_oracle import P, build, random_batch
 
@@ -317,3 +319,63 @@ def test_centralized_critic_learns_the_mean_over_dimensions(distributional: bool
     torch.testing.assert_close(together.loss(samples)[0], expected)
     assert not torch.allclose(alone.loss(samples)[0], expected)
     torch.testing.assert_close(together.act(samples.observation)[0], alone.act(samples.observation)[0])
+
+
+@pytest.mark.parametrize("distributional", [True, False])
+def test_centralized_target_pulls_every_dimension_to_the_mean(distributional: bool) -> None:
+    alone, together = (
+        build(0, P, 3, centralized_target=central, distributional=distributional, bc_loss_scale=0.0, rl_loss_scale=1.0)
+        for central in (False, True)
+    )
+    together.load_state_dict(alone.state_dict())
+    samples = random_batch(alone, 0, P)
+    with torch.no_grad():
+        path = encode(samples.action, alone.settings.levels, alone.settings.bins)
+        projected = alone.precompute(alone.critic, alone.encode(samples.observation))
+        taken = take_bin(alone.evaluate(alone.critic, projected, path), path)[..., 0, :]
+        target = alone.td_target(alone.encode(samples.next_observation), samples.reward, samples.discount)
+        each = []
+        for dim in range(3):
+            if distributional:
+                each.append(-(target.mean(2) * taken[:, :, dim].log_softmax(-1)).sum(-1).mean())
+            else:
+                each.append((taken[:, :, dim, 0] - target.mean(2)).square().mean())
+    torch.testing.assert_close(together.loss(samples)[0], torch.stack(each).mean())
+    assert not torch.allclose(alone.loss(samples)[0], torch.stack(each).mean())
+
+
+def test_the_authors_encoder_for_dmc() -> None:
+    """Four convolutions of 3x3, strides 2, 1, 1, 1, group norm of one group, SiLU: 32 * 35 * 35 features of 84x84."""
+    settings = resolve(CQNSettings, PRESETS, "reference_dmc_pixels", {"hidden_dim": 16, "shift_pixels": 0})
+    model = CQNModel({"camera": (3, 84, 84)}, 0, 2, settings)
+    assert model.pixel_size == 32 * 35 * 35
+    pixels = torch.randint(256, (2, 9, 84, 84), dtype=torch.uint8)
+    with torch.no_grad():
+        for weight in model.encoders.parameters():
+            weight.add_(0.1 * torch.randn_like(weight))
+        features, _ = model.encode(Observation((pixels,)))
+        x = pixels.double() / 255 - 0.5
+        state = {name: weight.double() for name, weight in model.encoders[0].state_dict().items()}
+        for layer, stride in enumerate((2, 1, 1, 1)):
+            x = F.conv2d(
+                x, state[f"convolutions.{layer}.weight"], state[f"convolutions.{layer}.bias"], stride=stride
+            )  # fmt: skip
+            mean, variance = x.mean((1, 2, 3), keepdim=True), x.var((1, 2, 3), keepdim=True, correction=0)
+            scale, shift = (state[f"norms.{layer}.{kind}"][None, :, None, None] for kind in ("weight", "bias"))
+            x = (x - mean) / torch.sqrt(variance + 1e-5) * scale + shift
+            x = x * torch.sigmoid(x)
+    assert features is not None
+    torch.testing.assert_close(features.double(), x.flatten(1), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"encoder_strides": (2, 1)}, "`encoder_strides` must be a positive number for each"),
+        ({"encoder_norm": "batch"}, "encoder_norm"),
+        ({"encoder_kernel": 0}, "`encoder_kernel` must be 1 to 16"),
+    ],
+)
+def test_encoders_that_cannot_be(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        CQNSettings(**changes)  # type: ignore[arg-type]

@@ -342,3 +342,18 @@ def test_shown_steps_weigh_the_same_when_steps_are_sampled() -> None:
     assert ((shown - count / 40) ** 2 / (count / 40)).sum() < 73  # 39 degrees of freedom, 0.1 %
     everything = sum(number == 1 for number, _ in places[:count])  # 70 of 90 steps, taught or not
     assert abs(everything / count - 70 / 90) < 0.012  # four standard deviations
+
+
+@pytest.mark.parametrize("by_step", [False, True])
+def test_full_windows_start_nowhere_near_the_end(by_step: bool) -> None:
+    """The starts that the authors' replay draws; an episode that is shorter than a window keeps its first."""
+    replay = Replay(1, 3, GAMMA, by_step=by_step, full_windows=True)
+    lengths = [7, 3, 1, 2]
+    for number, length in enumerate(lengths):
+        replay.add(make_episode(number, length), demo=True)
+    add_taught(replay, 4, [False] * 4 + [True] * 2)
+    batch = replay.sample(2000, 2000, np.random.default_rng(0))
+    places = [locate(batch, row) for row in range(4000)]
+    full = {(n, t) for n, length in enumerate(lengths) for t in range(max(1, length - 2))}
+    assert set(places[:2000]) == full | {(4, t) for t in range(4)}
+    assert set(places[2000:]) == full | {(4, 4)}  # of what a person drove, the first is kept

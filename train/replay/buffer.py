@@ -45,6 +45,7 @@ class Replay:
         folder: Path | None = None,
         capacity_gib: float = 16.0,
         by_step: bool = False,
+        full_windows: bool = False,
         sequence: int = 1,
         fill: str = "mask",
     ) -> None:
@@ -57,12 +58,14 @@ class Replay:
             folder: of its files, which survive a kill; None keeps everything in memory.
             capacity_gib: GiB of all rows together, demonstrations included; > 0.
             by_step: sample uniformly over time steps; else over episodes first, then over their steps.
+            full_windows: start no n-step window that the episode's end would shorten, as long as one start is left.
             sequence: T >= 1, actions of a sample.
             fill: what stands for actions beyond an episode's end (`CQNASSettings.sequence_fill`).
         """
         self.frame_stack, self.n_step, self.discount = frame_stack, n_step, discount
         self.folder, self.by_step = folder, by_step
         self.sequence, self.fill = sequence, fill
+        self._left_out = n_step - 1 if full_windows else 0  # starts at an episode's end
         self._capacity_bytes = int(capacity_gib * GIB)
         self._rows: dict[str, Rows] = {}
         self._places: list[Place] = []
@@ -321,7 +324,7 @@ class Replay:
     def _table(self) -> Table:
         """What is sampled from now."""
         if self._sampled is None:
-            self._sampled = Table.of(self._places)
+            self._sampled = Table.of(self._places, self._left_out)
         return self._sampled
 
     # -- after a kill ----------------------------------------------------------------------------------------
