@@ -14,6 +14,7 @@ from lerobot.optim.schedulers import LRSchedulerConfig
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from .errors import ConfigError
+from .schema import BASE_ACTION
 from .settings import CommonSettings
 
 __all__ = ["RLConfig", "given_fields"]
@@ -27,6 +28,9 @@ class RLConfig(PreTrainedConfig):
     """
 
     preset: str = ""
+    # policy to correct: its `pretrained_model` folder, or its name on the Hub, with a branch, tag or commit
+    base_path: str | None = None
+    base_revision: str | None = None
 
     # Observation
     frame_stack: int | None = None
@@ -87,6 +91,14 @@ class RLConfig(PreTrainedConfig):
         """The preset with this config's fields on top."""
         raise NotImplementedError
 
+    def refuse_local_base(self) -> None:
+        """Make sure that others can have the base too. Raises ConfigError where it is a folder of this machine."""
+        if self.base_path is not None and Path(self.base_path).exists():
+            raise ConfigError(
+                f"Others have no {self.base_path}: push the base policy first, and give its name on the Hub as "
+                "--policy.base_path."
+            )
+
     # -- what LeRobot asks a policy config -------------------------------------------------------------------
 
     @property
@@ -121,9 +133,9 @@ class RLConfig(PreTrainedConfig):
 
     @property
     def low_dim_features(self) -> dict[str, PolicyFeature]:
-        """Robot and environment state, in the order the network sees them."""
+        """Robot and environment state, and the base's action, in the order the network sees them."""
         known = self.input_features or {}
-        return {key: known[key] for key in (OBS_STATE, OBS_ENV_STATE) if key in known}
+        return {key: known[key] for key in (OBS_STATE, OBS_ENV_STATE, BASE_ACTION) if key in known}
 
     def validate_features(self) -> None:
         """Check that there is something to see and something to do.

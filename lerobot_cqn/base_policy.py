@@ -7,17 +7,19 @@ from typing import Any, ClassVar
 
 import torch
 from huggingface_hub import ModelCard, constants
+from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
 from . import processors  # noqa: F401  # registers the steps that checkpoints name
 from .base_config import RLConfig
+from .correction import absolute, base_of
 from .errors import ConfigError, DataError
 from .hub_retry import HubError, refuse_to_start, retried, said
 from .model import Model
 from .model_card import ModelFacts, as_readme, commands, data_facts
 from .n_step import n_step_return
-from .schema import ACTION, NEXT_REWARD, Batch, Observation
+from .schema import ACTION, BASE_ACTION, NEXT_REWARD, Batch, Observation
 
 __all__ = ["RLPolicy"]
 
@@ -46,7 +48,9 @@ class RLPolicy(PreTrainedPolicy):
         super().__init__(config)
         if dataset_meta is not None and config.push_to_hub:  # at the end of a training that begins now
             refuse_to_start()
+            config.refuse_local_base()
         _leave_out_depth(config, dataset_meta)
+        _see_the_base(config)
         config.validate_features()
         shapes = {key: feature.shape for key, feature in sorted(config.image_features.items())}
         self.view_keys = tuple(shapes)
@@ -77,6 +81,7 @@ class RLPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Forget the frame history; call at the start of each episode."""
         self._queue.clear()
+        self.forget_plan()
 
     def forget_newest(self) -> None:
         """Forget the last frame that was observed; another one takes its place."""
@@ -84,7 +89,9 @@ class RLPolicy(PreTrainedPolicy):
         self.forget_plan()
 
     def forget_plan(self) -> None:
-        """Nothing: a policy of single actions plans none ahead."""
+        """Forget what was planned ahead for a course that the episode did not take: the base's, where there is one."""
+        if self.config.base_path is not None:
+            base_of(absolute(self.config.base_path), self.config.base_revision).forget()
 
     def observe(self, batch: dict[str, Tensor]) -> Observation:
         """Push one frame [B, ...] per feature and return the stacked history; the first frame is repeated.
@@ -252,6 +259,14 @@ class RLPolicy(PreTrainedPolicy):
 
         push = super().push_model_to_hub
         retried(lambda: push(cfg, *args, **kwargs), PUSH_WAITS, explained, logger.warning)
+
+
+def _see_the_base(config: RLConfig) -> None:
+    """Let a policy that corrects another one see what that one would do."""
+    if config.base_path is not None and config.action_feature is not None:
+        config.base_path = absolute(config.base_path)
+        seen = PolicyFeature(FeatureType.STATE, tuple(config.action_feature.shape))
+        config.input_features = {**(config.input_features or {}), BASE_ACTION: seen}
 
 
 def _leave_out_depth(config: RLConfig, meta: Any) -> None:

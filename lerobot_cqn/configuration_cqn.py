@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 from lerobot.configs.policies import PreTrainedConfig
 
@@ -36,6 +37,10 @@ class CQNConfig(RLConfig):
     centralized_target: bool | None = None
     centralized_critic: bool | None = None
     next_action_from: str | None = None
+    # Correction of another policy
+    correction_range: float | None = None
+    correction_gripper: float | None = None
+    flat_bin: str | None = None
     # Acting
     act_with: str | None = None
     random_bin_below: float | None = None
@@ -43,4 +48,9 @@ class CQNConfig(RLConfig):
     @cached_property
     def settings(self) -> CQNSettings:
         """The preset with this config's fields on top."""
-        return resolve(CQNSettings, PRESETS, self.preset, given_fields(self))
+        given = {name: value for name, value in given_fields(self).items() if value is not None}
+        return resolve(CQNSettings, PRESETS, self.preset, self.correcting() | given)
+
+    def correcting(self) -> dict[str, Any]:
+        """Settings that follow from correcting another policy: it begins as that policy, and so without random bins."""
+        return {} if self.base_path is None else {"flat_bin": "middle", "random_bin_below": 0.0}

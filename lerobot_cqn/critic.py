@@ -26,6 +26,8 @@ from .settings import CQNSettings
 
 __all__ = ["CQNModel"]
 
+FLAT = 1e-6  # a spread of Q below this is rounding
+
 
 class CQNModel(Model):
     """Encoders, online critic and target critic; everything a checkpoint must carry to act as trained.
@@ -96,6 +98,8 @@ class CQNModel(Model):
                 logits = critic(precomputed, centre[:, None], torch.tensor([level], device=device))
             q = self.q_values(logits[:, 0])  # [B, D, N]
             index = q.argmax(-1)
+            if s.flat_bin == "middle":
+                index = torch.where(q.amax(-1) - q.amin(-1) < FLAT, s.bins // 2, index)
             if random_below > 0:
                 flat = (q.amax(-1) - q.amin(-1)) < random_below
                 index = torch.where(flat, torch.randint_like(index, s.bins), index)

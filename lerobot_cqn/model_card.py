@@ -271,12 +271,14 @@ def _introduction(facts: ModelFacts) -> str:
     learned = "from demonstrations" if facts.data is not None else "without demonstrations"
     learned += f", continued from {_origin(facts.origin)}," if facts.origin else ""
     rate = ""
+    corrected = facts.config.base_path
+    base = f" It corrects what {_origin(corrected)} does, and needs that policy to act." if corrected else ""
     if facts.results:
         last = facts.results[-1]
         rate = f" It succeeds in {last.successes} of {last.n} evaluation episodes."
     return (
         f"A **{name}** policy for [LeRobot](https://github.com/huggingface/lerobot), trained {learned} on "
-        f"**{plain(facts.task)}**.{rate} {how}".rstrip()
+        f"**{plain(facts.task)}**.{rate} {how}{base}".rstrip()
     )
 
 

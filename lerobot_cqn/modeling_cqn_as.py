@@ -31,8 +31,7 @@ class CQNASPolicy(RLPolicy):
 
     def reset(self) -> None:
         """Forget the frame history and all sequences; call at the start of each episode."""
-        super().reset()
-        self._player.reset()
+        super().reset()  # which forgets the plan, too
 
     def forget_plan(self) -> None:
         """Forget sequences that were chosen for a course which the episode did not take."""

@@ -28,7 +28,8 @@ from lerobot.utils.constants import (
 )
 
 from .base_config import RLConfig
-from .errors import DataError
+from .correction import AddBaseActionProcessorStep, BaseActionProcessorStep, absolute
+from .errors import ConfigError, DataError
 from .fit_pictures import FitPicturesProcessorStep
 from .joint_goals import (
     DeltaToGoalProcessorStep,
@@ -38,11 +39,14 @@ from .joint_goals import (
     undone_deltas,
 )
 from .scaling_check import check_scaling
-from .schema import BOUND_PROCESSOR
+from .schema import BASE_ACTION, BOUND_PROCESSOR, dimension_names
+from .settings import CQNASSettings, CQNSettings
 
 __all__ = ["BoundObservationProcessorStep", "Stats", "make_processors", "scaling_stats"]
 
 Stats = dict[str, dict[str, Any]]
+
+HELD = ("grip", "jaw", "finger")  # parts of names of what opens and closes
 
 
 @ProcessorStepRegistry.register(name=BOUND_PROCESSOR)
@@ -58,7 +62,7 @@ class BoundObservationProcessorStep(ObservationProcessorStep):
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         """Cut robot and environment state of an observation."""
         bounded = dict(observation)
-        for key in (OBS_STATE, OBS_ENV_STATE):
+        for key in (OBS_STATE, OBS_ENV_STATE, BASE_ACTION):
             if key in bounded:
                 value = torch.as_tensor(bounded[key])
                 if not torch.isfinite(value).all():
@@ -88,7 +92,7 @@ def scaling_stats(stats: Stats, margin: float, *, inverse: bool, bound_margin: f
     safe: Stats = {}
     for key, entry in stats.items():
         safe[key] = dict(entry)
-        if key not in (ACTION, OBS_STATE, OBS_ENV_STATE) or "min" not in entry:
+        if key not in (ACTION, OBS_STATE, OBS_ENV_STATE, BASE_ACTION) or "min" not in entry:
             continue
         low, high = np.asarray(entry["min"], dtype=np.float64), np.asarray(entry["max"], dtype=np.float64)
         widen = margin * (high - low) if key == ACTION else 0.0
@@ -124,11 +128,17 @@ def make_processors(
     if meta is not None and ACTION in meta.features:
         bound = config.settings.state_bound if OBS_STATE in features else None
         check_scaling(stats, meta, margin=margin, state_bound=bound)
+    ask: list[ProcessorStep] = []
+    add: list[ProcessorStep] = []
+    if config.base_path is not None:
+        ask, add, stats = _correction_steps(config, stats, meta)
+        margin, own, to_goal = 0.0, 0.0, []
     norm_map = {FeatureType(k): NormalizationMode(v) for k, v in config.normalization_mapping.items()}
     pre = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]](
         steps=[
             RenameObservationsProcessorStep(rename_map={}),
             AddBatchDimensionProcessorStep(),
+            *ask,
             *remember,
             *_picture_steps(features),
             DeviceProcessorStep(device=config.device),
@@ -149,6 +159,7 @@ def make_processors(
                 norm_map=norm_map,
                 stats=scaling_stats(stats, margin, inverse=True, bound_margin=own),
             ),
+            *add,
             *to_goal,
             DeviceProcessorStep(device="cpu"),
         ],
@@ -157,6 +168,33 @@ def make_processors(
         to_output=transition_to_policy_action,
     )
     return pre, post
+
+
+def _correction_steps(
+    config: RLConfig, stats: Stats, meta: Any
+) -> tuple[list[ProcessorStep], list[ProcessorStep], Stats]:
+    """Steps that ask the base and add to it, and statistics in which -1..1 is the range of a correction.
+
+    Raises ConfigError without action bounds, and where the dataset's actions are differences that `cqn-data delta` made
+    or undid: the base's are what the robot takes.
+    """
+    s, path = config.settings, absolute(str(config.base_path))
+    if not isinstance(s, CQNSettings) or isinstance(s, CQNASSettings):
+        raise ConfigError("Corrections are for --policy.type=cqn: leave out --policy.base_path, or change the type.")
+    if converted_deltas(meta) is not None or undone_deltas(meta) is not None:
+        raise ConfigError(
+            "The base's actions are what the robot takes, the dataset's were changed by `cqn-data delta`: give the "
+            "dataset as it was before."
+        )
+    if "min" not in stats.get(ACTION, {}):
+        raise ConfigError("Corrections are shares of the actions' range: give a dataset, or its statistics.")
+    low, high = (np.asarray(stats[ACTION][end], np.float64).reshape(-1) for end in ("min", "max"))
+    names = dimension_names(meta.features[ACTION]) if meta is not None else [str(i) for i in range(len(low))]
+    held = np.array([any(part in name.lower() for part in HELD) for name in names])
+    reach = np.where(held, s.correction_gripper, s.correction_range) * (high - low)
+    changed = {**stats, BASE_ACTION: stats[ACTION], ACTION: {"min": -reach, "max": reach}}
+    ask = BaseActionProcessorStep(path, config.base_revision)
+    return [ask], [AddBaseActionProcessorStep(path, low.tolist(), high.tolist(), config.base_revision)], changed
 
 
 def _goal_steps(dataset_meta: Any) -> tuple[list[ProcessorStep], list[ProcessorStep]]:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:  # names and the history are needed by commands that answer at
 
 __all__ = [
     "ACTION",
+    "BASE_ACTION",
     "BOUND_PROCESSOR",
     "HISTORY",
     "NEXT_DONE",
@@ -44,6 +45,7 @@ __all__ = [
 
 ACTION = "action"
 STATE = "observation.state"
+BASE_ACTION = "observation.base_action"  # what the policy that is corrected would do, [D]
 NEXT_REWARD = "next.reward"
 NEXT_DONE = "next.done"
 NEXT_SUCCESS = "next.success"

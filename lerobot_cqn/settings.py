@@ -108,6 +108,11 @@ class CQNSettings(CommonSettings):
     centralized_target: bool = False  # True: every dimension is pulled to the mean over D of the targets (robobase's)
     centralized_critic: bool = False  # True: one value for the whole action, the mean over D (an ablation of the paper)
     next_action_from: str = "online"  # the authors' double-Q style; "target" is equation 2 as written
+    # Correction of another policy (`--policy.base_path`), as shares of each action dimension's range
+    correction_range: float = number(0.1, above=0, most=1)  # largest correction, to either side
+    correction_gripper: float = number(0.0, least=0, most=1)  # the same of a gripper; 0 leaves it to the base
+    # bin where all are worth the same: the "first", or the "middle" one, which corrects nothing
+    flat_bin: str = "first"
     # Acting
     act_with: str = "target"  # critic that acts: the target or the online one
     # exploring only: a spread of Q under this picks a random bin; 0 is off
@@ -119,6 +124,10 @@ class CQNSettings(CommonSettings):
         for name in ("act_with", "next_action_from"):
             if getattr(self, name) not in ("online", "target"):
                 raise ConfigError(one_of(f"value of `{name}`", getattr(self, name), ("online", "target")))
+        if self.flat_bin not in (bins := ("first", "middle")):
+            raise ConfigError(one_of("value of `flat_bin`", self.flat_bin, bins))
+        if self.flat_bin == "middle" and self.bins % 2 == 0:
+            raise ConfigError(f"`bins` must be odd for `flat_bin=middle`, as corrections need it, got {self.bins}.")
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from lerobot.processor import (
 from numpy.typing import NDArray
 
 from lerobot_cqn.base_policy import RLPolicy
+from lerobot_cqn.correction import AddBaseActionProcessorStep, Base, absolute, base_of
 from lerobot_cqn.delta_actions import DeltaJoints
 from lerobot_cqn.errors import DataError
 from lerobot_cqn.joint_goals import DeltaToGoalProcessorStep
@@ -74,11 +75,18 @@ class Agent:
     @property
     def deltas(self) -> DeltaJoints | None:
         """Differences among the policy's actions that the postprocessor turns into goals; None: none."""
-        return next((step.deltas for step in self._goal_steps), None)
+        return next((step.deltas for step in self._goal_steps if isinstance(step, DeltaToGoalProcessorStep)), None)
 
     @property
-    def _goal_steps(self) -> list[DeltaToGoalProcessorStep]:
-        return [step for step in self.postprocessor.steps if isinstance(step, DeltaToGoalProcessorStep)]
+    def base(self) -> Base | None:
+        """The policy that this one corrects; None: none."""
+        config = self.policy.config
+        return None if config.base_path is None else base_of(absolute(config.base_path), config.base_revision)
+
+    @property
+    def _goal_steps(self) -> list[DeltaToGoalProcessorStep | AddBaseActionProcessorStep]:
+        kinds = (DeltaToGoalProcessorStep, AddBaseActionProcessorStep)
+        return [step for step in self.postprocessor.steps if isinstance(step, kinds)]
 
     def act(self, prepared: Frame, *, explore: bool, at_random: bool = False) -> tuple[torch.Tensor, NDArray[Any]]:
         """Normalised actions [K, D] in [-1, 1] for K rows, and the mean Q [K] of what the policy would do.

@@ -189,6 +189,8 @@ class RunConfig:
         if self.policy.push_to_hub:
             check_repo_id(self.policy.repo_id or "", "--policy.repo_id")
         acts_in = self._validated_world()
+        if self.policy.base_path is not None:
+            self._check_correction(self.policy)
         recipe = self.recipe
         if not recipe.batch_size + recipe.demo_batch_size:
             raise ConfigError("A batch of nothing: give --batch_size or --demo_batch_size above 0.")
@@ -212,6 +214,16 @@ class RunConfig:
         if recipe.action_bounds not in (valid := ("data", "environment")):
             raise ConfigError(one_of("action_bounds", recipe.action_bounds, valid))
         return ValidRun(config=self, policy=self.policy, output_dir=self.output_dir, acts_in=acts_in)
+
+    def _check_correction(self, policy: RLConfig) -> None:
+        if self.robot is not None:
+            raise ConfigError("On an arm no other policy can be corrected yet: leave out --policy.base_path.")
+        if self.recipe.action_bounds != "data":
+            raise ConfigError(
+                "Corrections are shares of the demonstrated range: give --action_bounds=data and a dataset."
+            )
+        if policy.push_to_hub:
+            policy.refuse_local_base()
 
     def _validated_world(self) -> EnvConfig | RobotConfig:
         if self.env is not None and self.robot is not None:

@@ -35,7 +35,7 @@ FLOORS: dict[str, str] = {
     "lerobot_cqn": (
         "errors schema|ranges discretisation|distributional|augmentation|n_step losses settings networks model "
         "critic|actor_critic|learner sequence delta_actions|scaling_check "
-        "joint_goals|fit_pictures|history_text|hub_retry base_config model_card|processors base_policy "
+        "joint_goals|fit_pictures|history_text|hub_retry|correction base_config model_card|processors base_policy "
         "configuration_cqn|configuration_drqv2 configuration_cqn_as "
         "processor_cqn|processor_cqn_as|processor_drqv2 modeling_cqn|modeling_cqn_as|modeling_drqv2"
     ),

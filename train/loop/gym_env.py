@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.base_policy import RLPolicy
 from lerobot_cqn.errors import ConfigError, DataError
+from lerobot_cqn.schema import BASE_ACTION
 
 from ..interfaces import Environment, Frame, Outcome, Outcomes
 
@@ -171,6 +172,8 @@ def check_fits(env: EnvConfig, policy: RLPolicy, source: str) -> None:
     """
     given, needed = env_to_policy_features(env), policy.config.input_features or {}
     for key, feature in needed.items():
+        if key == BASE_ACTION:  # the base's own, beside what the environment gives
+            continue
         if key not in given:
             raise ConfigError(
                 f"The {source} has '{key}', which the environment does not give (it gives {sorted(given)}): "

@@ -31,7 +31,7 @@ def push(config: PushConfig) -> None:
     """Send the policy of a run.
 
     Raises:
-        ConfigError: an option has a wrong form.
+        ConfigError: an option has a wrong form, or the policy corrects one that is on this machine only.
         DataError: there is no such checkpoint, or it cannot be loaded.
         HubError: nobody is logged in, or the Hub refused or could not be reached; it names the command that goes on.
         Interrupted: Ctrl-C while sending.
@@ -47,6 +47,7 @@ def push(config: PushConfig) -> None:
         found, config.repo_id, films=config.films, license=config.license, tags=tuple(config.tags),
         dataset=config.dataset,
     )  # fmt: skip
+    facts.config.refuse_local_base()
     if config.dry_run:
         card = _card(facts, None)
         show_dry({**files, README: card.encode()}, card, config.repo_id)

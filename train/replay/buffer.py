@@ -128,8 +128,10 @@ class Replay:
                 " make the pictures smaller (cqn-data resize)."
             )
         self._write(arrays, start, stop)
-        ended, success = episode.terminated, episode.success
-        self._keep(Place(start=start, length=len(episode), terminated=ended, success=success, demo=success))
+        ended, success, shown = episode.terminated, episode.success, episode.taught
+        demo = success and not shown  # else only some of its steps are to be imitated
+        place = Place(start=start, length=len(episode), terminated=ended, success=success, demo=demo, taught=shown)
+        self._keep(place)
         self._fixed, self._ring, self._head = self.episodes, stop, stop
 
     def add(self, episode: Episode, *, demo: bool, number: int = -1, note: dict[str, Any] | None = None) -> None:

@@ -18,16 +18,19 @@ from cqn_data.decisions.rewards import REWARD_FEATURES, demonstration_end
 from cqn_data.disk.source import open_source
 from cqn_data.disk.whole import refuse_damaged
 from lerobot_cqn.errors import DataError
-from lerobot_cqn.schema import NEXT_REWARD, NEXT_SUCCESS
+from lerobot_cqn.schema import BASE_ACTION, NEXT_REWARD, NEXT_SUCCESS
 
 from ..agent import Agent
 from ..config import DatasetSettings, Recipe
-from .episode import Episode
+from .episode import Episode, spans
 
 __all__ = ["Demonstrations", "counts_as_demonstration", "load_metadata"]
 
 logger = logging.getLogger(__name__)
 
+PICTURES = ("video", "image")
+AT_A_TIME = 32  # rows with pictures
+REACHED = 1.001  # a correction of this size is still within the range, but for rounding
 KEPT = 0.5  # of the steps; where fewer come before the ends of their episodes, a line says so
 
 
@@ -106,13 +109,22 @@ class Demonstrations:
         Raises DataError for a missing feature, another size, values that are not finite, or a damaged dataset.
         """
         dataset, policy = self.dataset, agent.policy
-        missing = [key for key in (*policy.view_keys, *policy.low_dim_keys, ACTION) if key not in dataset.features]
+        vectors_of = [key for key in policy.low_dim_keys if key != BASE_ACTION]
+        needed = [
+            *policy.view_keys,
+            *vectors_of,
+            ACTION,
+            *(agent.base.config.input_features or {} if agent.base else ()),
+        ]
+        missing = [key for key in needed if key not in dataset.features]
         if missing:
             raise DataError(
                 f"The dataset has no '{missing[0]}', which the policy needs; it has {sorted(dataset.features)}."
             )
         found = dataset_to_policy_features(dataset.features)
         for key, feature in {**(policy.config.input_features or {}), ACTION: policy.config.action_feature}.items():
+            if key == BASE_ACTION:
+                continue
             if tuple(found[key].shape) != tuple(feature.shape):
                 raise DataError(
                     f"'{key}' has shape {tuple(found[key].shape)} in the dataset, but {tuple(feature.shape)} in the "
@@ -122,7 +134,8 @@ class Demonstrations:
         judged = [key for key in REWARD_FEATURES if key in dataset.features]
         columns = dataset.hf_dataset.with_format("numpy")
         numbers = np.asarray(columns["episode_index"])
-        raw = {key: _column(columns, key) for key in (*policy.low_dim_keys, ACTION, *judged)}
+        plain = [key for key in dict.fromkeys((*vectors_of, *needed)) if dataset.features[key]["dtype"] not in PICTURES]
+        raw = {key: _column(columns, key) for key in dict.fromkeys((*plain, *judged))}
         _check_finite(raw, numbers)
         if not rewarded:
             logger.warning("No '%s' column: the last step of each episode counts as the success.", NEXT_REWARD)
@@ -132,8 +145,13 @@ class Demonstrations:
         vectors = {key: torch.from_numpy(value).float() for key, value in raw.items() if key not in REWARD_FEATURES}
         if not policy.low_dim_keys:  # LeRobot's steps insist on an observation; pictures are decoded below
             vectors[policy.view_keys[0]] = torch.zeros(1, 3, 1, 1)
-        prepared = agent.prepare(vectors)
-        low_dim, action = agent.low_dim(prepared), prepared[ACTION].cpu().numpy()
+        low_dim, action = _prepared(agent, dataset, vectors)
+        imitable = None if agent.base is None else _within_reach(agent, action)
+        if imitable is not None and not imitable.all():
+            logger.warning(
+                "%d of %d demonstrated steps lie beyond --policy.correction_range of what the base does: they are not "
+                "imitated.", (~imitable).sum(), len(imitable),
+            )  # fmt: skip
         episodes = []
         ids = np.unique(numbers)
         for count, number in enumerate(ids):
@@ -155,6 +173,7 @@ class Demonstrations:
                     reward=reward[: len(rows)].astype(np.float32),
                     terminated=success,
                     success=success,
+                    taught=() if imitable is None or imitable[rows].all() else spans(imitable[rows].tolist()),
                 )
             )
             on_episode(count + 1, len(ids))
@@ -166,6 +185,34 @@ class Demonstrations:
                 kept, len(numbers), " and ".join(judged),
             )  # fmt: skip
         return episodes
+
+
+def _prepared(
+    agent: Agent, dataset: LeRobotDataset, vectors: dict[str, torch.Tensor]
+) -> tuple[NDArray[Any] | None, NDArray[Any]]:
+    """Normalised state [K, P] and action [K, D] of all rows; a base that needs pictures sees some rows at a time."""
+    base, rows = agent.base, len(vectors[ACTION])
+    views = [] if base is None else list(base.config.image_features)
+    if not views:
+        prepared = agent.prepare(vectors)
+        return agent.low_dim(prepared), prepared[ACTION].cpu().numpy()
+    parts = []
+    for first in range(0, rows, AT_A_TIME):
+        items = [dataset[row] for row in range(first, min(first + AT_A_TIME, rows))]
+        seen = {key: torch.stack([item[key] for item in items]) for key in views}
+        parts.append(agent.prepare({**{k: v[first : first + AT_A_TIME] for k, v in vectors.items()}, **seen}))
+    low_dim = [agent.low_dim(part) for part in parts]
+    action = np.concatenate([part[ACTION].cpu().numpy() for part in parts])
+    return (None if low_dim[0] is None else np.concatenate(low_dim)), action  # type: ignore[arg-type]
+
+
+def _within_reach(agent: Agent, action: NDArray[Any]) -> NDArray[np.bool_]:
+    """Steps [K] whose corrections [K, D] can be made; a dimension that is left to the base is, in `action`, too."""
+    bounds = agent.ranges(ACTION)
+    assert bounds is not None  # noqa: S101  # the range of corrections is made with the policy
+    action[:, bounds[1] == 0] = 0
+    within: NDArray[np.bool_] = (np.abs(action) <= REACHED).all(axis=1)
+    return within
 
 
 def _column(columns: Any, key: str) -> NDArray[Any]:

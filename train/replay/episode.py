@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Episode"]
+__all__ = ["Episode", "spans"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,3 +40,9 @@ class Episode:
         for name, values in (("action", self.action), ("reward", self.reward)):
             rows[name] = np.concatenate([values, np.zeros_like(values[:1])]).astype(np.float32)
         return rows | {f"view_{i}": view for i, view in enumerate(self.pixels)}
+
+
+def spans(flags: list[bool]) -> tuple[tuple[int, int], ...]:
+    """Runs of True as (first, one past the last)."""
+    edges = np.flatnonzero(np.diff([0, *map(int, flags), 0])).tolist()
+    return tuple(zip(edges[::2], edges[1::2], strict=True))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..agent import Agent
 from ..interfaces import Frame
-from .episode import Episode
+from .episode import Episode, spans
 
 __all__ = ["Recorder"]
 
@@ -62,12 +62,6 @@ class Recorder:
             reward=np.asarray(self.reward, dtype=np.float32),
             terminated=terminated,
             success=success,
-            taught=_spans(self.taught),
+            taught=spans(self.taught),
             borders=tuple(sorted(self.borders - {0, len(self)})),
         )
-
-
-def _spans(flags: list[bool]) -> tuple[tuple[int, int], ...]:
-    """Runs of True as (first, one past the last)."""
-    edges = np.flatnonzero(np.diff([0, *map(int, flags), 0])).tolist()
-    return tuple(zip(edges[::2], edges[1::2], strict=True))
