@@ -16,7 +16,7 @@ from lerobot_cqn.losses import margin_loss, take_bin
 from lerobot_cqn.schema import Batch, Observation
 from lerobot_cqn.settings import PRESETS, CQNSettings, resolve
 
-from .test_oracle import P, build, random_batch
+from .test_oracle import SMALL, P, build, random_batch
 
 
 def weights(model: CQNModel) -> dict[str, Tensor]:
@@ -298,24 +298,35 @@ def test_augmentation_is_part_of_the_update_only() -> None:
     assert jittered.is_floating_point()
 
 
+def taken_and_target(model: CQNModel, samples: Batch) -> tuple[Tensor, Tensor]:
+    """Outputs for the taken bins, and what they are pulled to; [B, L, D, A] each, the target [B, L, D] when scalar."""
+    with torch.no_grad():
+        path = encode(samples.action, model.settings.levels, model.settings.bins)
+        projected = model.precompute(model.critic, model.encode(samples.observation))
+        taken = take_bin(model.evaluate(model.critic, projected, path), path)[..., 0, :]
+        return taken, model.td_target(model.encode(samples.next_observation), samples.reward, samples.discount)
+
+
+def pair_of(distributional: bool, **changes: object) -> tuple[CQNModel, CQNModel]:
+    """Two models with the same weights, of which the second one has `changes`."""
+    alone, changed = (
+        build(0, P, 3, distributional=distributional, bc_loss_scale=0.0, rl_loss_scale=1.0, **more)
+        for more in ({}, changes)
+    )
+    changed.load_state_dict(alone.state_dict())
+    return alone, changed
+
+
 @pytest.mark.parametrize("distributional", [True, False])
 def test_centralized_critic_learns_the_mean_over_dimensions(distributional: bool) -> None:
     """Against the definition, value by value; nothing else of the loss changes."""
-    alone, together = (
-        build(0, P, 3, centralized_critic=central, distributional=distributional, bc_loss_scale=0.0, rl_loss_scale=1.0)
-        for central in (False, True)
-    )
-    together.load_state_dict(alone.state_dict())
+    alone, together = pair_of(distributional, centralized_critic=True)
     samples = random_batch(alone, 0, P)
-    with torch.no_grad():
-        path = encode(samples.action, alone.settings.levels, alone.settings.bins)
-        projected = alone.precompute(alone.critic, alone.encode(samples.observation))
-        taken = take_bin(alone.evaluate(alone.critic, projected, path), path)[..., 0, :]
-        target = alone.td_target(alone.encode(samples.next_observation), samples.reward, samples.discount)
-        if distributional:
-            expected = -(target.mean(2) * taken.softmax(-1).mean(2).log()).sum(-1).mean()
-        else:
-            expected = (taken[..., 0].mean(2) - target.mean(2)).square().mean()
+    taken, target = taken_and_target(alone, samples)
+    if distributional:
+        expected = -(target.mean(2) * taken.softmax(-1).mean(2).log()).sum(-1).mean()
+    else:
+        expected = (taken[..., 0].mean(2) - target.mean(2)).square().mean()
     torch.testing.assert_close(together.loss(samples)[0], expected)
     assert not torch.allclose(alone.loss(samples)[0], expected)
     torch.testing.assert_close(together.act(samples.observation)[0], alone.act(samples.observation)[0])
@@ -323,25 +334,29 @@ def test_centralized_critic_learns_the_mean_over_dimensions(distributional: bool
 
 @pytest.mark.parametrize("distributional", [True, False])
 def test_centralized_target_pulls_every_dimension_to_the_mean(distributional: bool) -> None:
-    alone, together = (
-        build(0, P, 3, centralized_target=central, distributional=distributional, bc_loss_scale=0.0, rl_loss_scale=1.0)
-        for central in (False, True)
-    )
-    together.load_state_dict(alone.state_dict())
+    alone, together = pair_of(distributional, centralized_target=True)
     samples = random_batch(alone, 0, P)
-    with torch.no_grad():
-        path = encode(samples.action, alone.settings.levels, alone.settings.bins)
-        projected = alone.precompute(alone.critic, alone.encode(samples.observation))
-        taken = take_bin(alone.evaluate(alone.critic, projected, path), path)[..., 0, :]
-        target = alone.td_target(alone.encode(samples.next_observation), samples.reward, samples.discount)
-        each = []
-        for dim in range(3):
-            if distributional:
-                each.append(-(target.mean(2) * taken[:, :, dim].log_softmax(-1)).sum(-1).mean())
-            else:
-                each.append((taken[:, :, dim, 0] - target.mean(2)).square().mean())
+    taken, target = taken_and_target(alone, samples)
+    each = []
+    for dim in range(3):
+        if distributional:
+            each.append(-(target.mean(2) * taken[:, :, dim].log_softmax(-1)).sum(-1).mean())
+        else:
+            each.append((taken[:, :, dim, 0] - target.mean(2)).square().mean())
     torch.testing.assert_close(together.loss(samples)[0], torch.stack(each).mean())
     assert not torch.allclose(alone.loss(samples)[0], torch.stack(each).mean())
+
+
+@pytest.mark.parametrize("distributional", [True, False])
+@pytest.mark.parametrize("bins", [3, 5])
+def test_a_critic_without_preference_takes_the_middle_where_told_so(distributional: bool, bins: int) -> None:
+    settings = CQNSettings(**(SMALL | {"bins": bins, "flat_bin": "middle", "distributional": distributional}))  # type: ignore[arg-type]
+    model = CQNModel({}, P, 3, settings)
+    action, _ = model.act(Observation((), torch.randn(4, P)))
+    assert action.abs().max() < 1e-6
+    with torch.no_grad():
+        model.target_critic.advantage.head.bias.normal_(0, 0.1)  # from here on it has preferences
+    assert model.act(Observation((), torch.randn(4, P)))[0].abs().max() > 0.1
 
 
 def test_the_authors_encoder_for_dmc() -> None:

@@ -10,11 +10,15 @@ from hypothesis import strategies as st
 from lerobot.configs.types import FeatureType, PolicyFeature
 from torch import Tensor
 
+from cqn_train.agent import Agent
+from cqn_train.interfaces import Outcome
+from cqn_train.replay.recorder import Recorder
 from lerobot_cqn.configuration_cqn_as import CQNASConfig
 from lerobot_cqn.critic import CQNModel
 from lerobot_cqn.errors import ConfigError
 from lerobot_cqn.learner import Learner
 from lerobot_cqn.modeling_cqn_as import CQNASPolicy
+from lerobot_cqn.processor_cqn_as import make_cqn_as_pre_post_processors
 from lerobot_cqn.schema import Batch, Observation
 from lerobot_cqn.sequence import CQNASModel, OpenLoop, TemporalEnsemble, filled
 from lerobot_cqn.settings import CQN_AS_PRESETS, CQNASSettings, CQNSettings, resolve
@@ -133,6 +137,39 @@ def test_what_a_pause_or_a_person_came_between_is_not_played() -> None:
     assert torch.equal(policy.select_action(frame(4)), chunk.predict_action_chunk(frame(4))[:, 0])
     policy.forget_plan()  # a person drove
     assert torch.equal(policy.select_action(frame(6)), chunk.predict_action_chunk(frame(6))[:, 0])
+
+
+def test_the_loop_says_where_another_drove_and_where_a_pause_lay() -> None:
+    policy, alone = policy_of(action_sequence=4), policy_of(action_sequence=4)
+    agent = Agent(policy, *make_cqn_as_pre_post_processors(policy.config))
+    recorder = Recorder(agent)
+
+    def step(seed: int, *, taught: bool = False, skipped: bool = False) -> None:
+        prepared = agent.prepare(frame(seed))
+        if not len(recorder):
+            recorder.observe(prepared, frame(seed))
+        action, _ = agent.act(prepared, explore=False)
+        outcome = Outcome(
+            frame=frame(seed + 1), reward=0.0, terminated=False, truncated=False, success=False, sent=action,
+            taught=taught, skipped=skipped,
+        )  # fmt: skip
+        executed = agent.carried_out(action, outcome)
+        following = agent.prepare(outcome.frame)
+        if skipped:
+            recorder.retake(following, outcome.frame, 0.0)
+            agent.retake(first=not len(recorder))
+        else:
+            recorder.step(executed, 0.0, taught=taught)
+            recorder.observe(following, outcome.frame)
+
+    for seed, what in enumerate(["", "", "taught", "", "skipped", "skipped", "", ""]):
+        step(seed, taught=what == "taught", skipped=what == "skipped")
+        if what:  # what was planned before is gone
+            chosen = agent.act(agent.prepare(frame(90)), explore=False)[0]
+            assert torch.equal(chosen, alone.predict_action_chunk(frame(90))[:, 0])
+            agent.policy.forget_plan()
+    episode = recorder.episode(terminated=True, success=False)
+    assert (len(episode), episode.taught, episode.borders) == (6, ((2, 3),), (4,))
 
 
 @pytest.mark.parametrize("ensemble", [True, False])
