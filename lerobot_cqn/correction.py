@@ -34,18 +34,19 @@ class Base:
         action: what it did last, [K, D] in its own units; None before the first frame of an episode.
     """
 
-    def __init__(self, path: str, revision: str | None = None, device: str = "cpu") -> None:
-        """Load it. Raises DataError, in one line, where that cannot be."""
+    def __init__(self, path: str, revision: str | None = None) -> None:
+        """Load it, on its own device where there is one. Raises DataError, in one line, where that cannot be."""
         # It takes seconds, and settings are refused without it.
         from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
         register_third_party_plugins()  # it may be of a type that somebody else made
         try:
-            config = PreTrainedConfig.from_pretrained(path, revision=revision, cli_overrides=[f"--device={device}"])
+            config = PreTrainedConfig.from_pretrained(path, revision=revision)
             policy = get_policy_class(config.type).from_pretrained(path, config=config, revision=revision)
             self._pre, self._post = make_pre_post_processors(
-                config, pretrained_path=path, preprocessor_overrides={"device_processor": {"device": device}}
-            )
+                config, pretrained_path=path, pretrained_revision=revision,
+                preprocessor_overrides={"device_processor": {"device": config.device}},
+            )  # fmt: skip
         except Exception as error:  # each policy type raises kinds of its own
             reason = " ".join(str(error).split())[:160] or type(error).__name__
             raise DataError(
@@ -75,6 +76,10 @@ class Base:
         if missing:
             found = sorted(key for key in frame if key.startswith(OBSERVATION))
             raise DataError(f"The base policy needs '{missing[0]}', and the observation has {found}.")
+        for key, feature in (self.config.input_features or {}).items():
+            size = tuple(frame[key].shape[1:])
+            if len(feature.shape) == 1 and size != tuple(feature.shape):
+                raise DataError(f"The base policy needs '{key}' of shape {tuple(feature.shape)}, and gets {size}.")
         given = {key: _as_lerobot_gives(value) for key, value in frame.items()}
         with torch.inference_mode():
             action = self._post(self.policy.select_action(self._pre(given)))
@@ -89,6 +94,15 @@ class Base:
         action = self.act(frames)
         self.reset()
         return action
+
+
+def _refuse_another_arm(base: Tensor, ours: Tensor) -> None:
+    """Raises DataError where actions of the base and ours, [K, D] each, differ in their dimensions."""
+    if base.shape[-1] != ours.shape[-1]:
+        raise DataError(
+            f"The base policy's actions have {base.shape[-1]} dimensions, the demonstrations' {ours.shape[-1]}: give"
+            " demonstrations of what the base does."
+        )
 
 
 def _as_lerobot_gives(value: Any) -> Any:
@@ -124,6 +138,7 @@ class BaseActionProcessorStep(ProcessorStep):
         changed = transition.copy()
         if isinstance(demonstrated, Tensor):
             observation[BASE_ACTION] = base.act_apart(frame)
+            _refuse_another_arm(observation[BASE_ACTION], demonstrated)
             changed[TransitionKey.ACTION] = demonstrated - observation[BASE_ACTION].to(demonstrated)
         else:
             observation[BASE_ACTION] = base.act(frame)
@@ -159,6 +174,7 @@ class AddBaseActionProcessorStep(ProcessorStep):
         if not isinstance(correction, Tensor):
             return transition
         base = self._acted().to(correction.dtype).to(correction.device)
+        _refuse_another_arm(base, correction)
         low, high = (torch.tensor(end, dtype=base.dtype, device=base.device) for end in (self.low, self.high))
         changed = transition.copy()
         changed[TransitionKey.ACTION] = torch.clamp(

@@ -42,6 +42,7 @@ Train a Coarse-to-fine Q-Network from demonstrations, then online.
   start from a trained policy:               cqn-train --policy.path=outputs/click/checkpoints/last/pretrained_model ...
   imitation only (the paper's CBC):          cqn-train --policy.rl_loss_scale=0 --steps=0 --offline_updates=5000 ...
   with action sequences (CQN-AS):            cqn-train --policy.type=cqn_as --policy.preset=laptop_state ...
+  correct a policy one already has:          cqn-train --policy.base_path=outputs/act/.../pretrained_model ...
   the paper's actor-critic baseline:         cqn-train --policy.type=drqv2 --policy.preset=drqv2_plus ...
   without demonstrations:                    cqn-train --policy.preset=paper_dmc_state --env.type=dmc ...
   on an arm, with a person at a web page:    cqn-train --robot.type=so101_follower --robot.port=... \\
@@ -49,7 +50,7 @@ Train a Coarse-to-fine Q-Network from demonstrations, then online.
                                                --policy.preset=paper_real_world --online_minutes=10 ...
   evaluate with LeRobot:                     lerobot-eval --policy.path=.../pretrained_model --env.type=ur5e_station
 
-Presets (--policy.preset=NAME; every number can be replaced, docs/algorithm.md and docs/baselines.md have them):
+Presets (--policy.preset=NAME; every number can be replaced, docs/configuration.md has them):
 """
 
 PRESETS: dict[str, dict[str, str]] = {
@@ -92,7 +93,7 @@ LAST = (
 def introduction() -> str:
     """Beginning of `--help`: examples, and the presets by name."""
     lines = [
-        f"  --policy.type={policy:<6} {name:<18} {what}"
+        f"  --policy.type={policy:<6} {name:<22} {what}"
         for policy, names in PRESETS.items()
         for name, what in names.items()
     ]

@@ -19,7 +19,7 @@ from cqn_train.replay.buffer import Replay
 from cqn_train.replay.demonstrations import Demonstrations, load_metadata
 from lerobot_cqn.configuration_cqn import CQNConfig
 from lerobot_cqn.configuration_cqn_as import CQNASConfig
-from lerobot_cqn.correction import Base, base_of
+from lerobot_cqn.correction import AddBaseActionProcessorStep, Base, base_of
 from lerobot_cqn.errors import ConfigError, DataError
 from lerobot_cqn.schema import BASE_ACTION
 
@@ -217,6 +217,15 @@ def test_sequences_are_no_corrections(bases: dict[str, Path], data: Path) -> Non
 
 
 def test_a_base_that_needs_more_than_there_is(bases: dict[str, Path]) -> None:
+    with pytest.raises(DataError, match=r"needs 'observation.state' of shape \(3,\), and gets \(4,\)"):
+        Base(str(bases["act"])).act({STATE: torch.zeros(1, 4), ENV: torch.zeros(1, 2)})
     with pytest.raises(DataError, match=r"needs 'observation.environment_state', and the observation has"):
         Base(str(bases["act"])).act({STATE: torch.zeros(1, 3)})
     assert PolicyFeature(FeatureType.STATE, (3,)) == Base(str(bases["act"])).config.input_features[STATE]
+
+
+def test_a_base_of_another_arm(bases: dict[str, Path]) -> None:
+    base_of(str(bases["act"])).act(frames(1)[0])
+    step = AddBaseActionProcessorStep(str(bases["act"]), [0.0] * 6, [1.0] * 6)
+    with pytest.raises(DataError, match="actions have 4 dimensions, the demonstrations' 6"):
+        step({"action": torch.zeros(2, 6)})  # type: ignore[typeddict-item]
