@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from lerobot_cqn.ranges import Range, check_ranges
+from lerobot_cqn.schema import opens_and_closes
 
 if TYPE_CHECKING:  # options are read without NumPy
     import numpy as np
@@ -11,7 +12,6 @@ if TYPE_CHECKING:  # options are read without NumPy
 
 __all__ = ["Hand", "HumanOperator", "moving_dims"]
 
-HELD = ("grip", "jaw", "finger")  # parts of names of what a hand opens and closes: it comes late and nothing else
 HESITATES_STEPS = (2, 6)
 SLOW = 1 / 7  # share of the speed that is left while hesitating
 DETOUR_S = 0.8  # time constant in which a person comes back to the straight way
@@ -44,7 +44,7 @@ def moving_dims(names: list[str], low: "NDArray[Any]", high: "NDArray[Any]") -> 
     """Dimensions of an action that are movements: as far one way as the other, and no gripper by their name."""
     import numpy as np
 
-    held = np.array([any(part in name.lower() for part in HELD) for name in names])
+    held = np.array([opens_and_closes(name) for name in names])
     return np.flatnonzero(~held & np.isclose(low, -high))
 
 

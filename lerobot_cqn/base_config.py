@@ -82,8 +82,10 @@ class RLConfig(PreTrainedConfig):
     push_to_hub: bool = False
 
     def __post_init__(self) -> None:
-        """Let LeRobot choose the device, then check every number."""
+        """Let LeRobot choose the device, then check every number; a base's folder is named as it is from anywhere."""
         super().__post_init__()
+        if self.base_path is not None and Path(self.base_path).exists():
+            self.base_path = str(Path(self.base_path).resolve())
         _ = self.settings
 
     @cached_property
@@ -166,5 +168,5 @@ class RLConfig(PreTrainedConfig):
 
 
 def given_fields(config: RLConfig) -> dict[str, Any]:
-    """Fields of a config by name, nested features not copied."""
-    return {f.name: getattr(config, f.name) for f in fields(config)}
+    """Fields of a config that are not None by name, nested features not copied."""
+    return {f.name: value for f in fields(config) if (value := getattr(config, f.name)) is not None}

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from . import processors  # noqa: F401  # registers the steps that checkpoints name
 from .base_config import RLConfig
-from .correction import absolute, base_of
+from .correction import base_of
 from .errors import ConfigError, DataError
 from .hub_retry import HubError, refuse_to_start, retried, said
 from .model import Model
@@ -91,7 +91,7 @@ class RLPolicy(PreTrainedPolicy):
     def forget_plan(self) -> None:
         """Forget what was planned ahead for a course that the episode did not take: the base's, where there is one."""
         if self.config.base_path is not None:
-            base_of(absolute(self.config.base_path), self.config.base_revision).forget()
+            base_of(self.config.base_path, self.config.base_revision).forget()
 
     def observe(self, batch: dict[str, Tensor]) -> Observation:
         """Push one frame [B, ...] per feature and return the stacked history; the first frame is repeated.
@@ -264,7 +264,6 @@ class RLPolicy(PreTrainedPolicy):
 def _see_the_base(config: RLConfig) -> None:
     """Let a policy that corrects another one see what that one would do."""
     if config.base_path is not None and config.action_feature is not None:
-        config.base_path = absolute(config.base_path)
         seen = PolicyFeature(FeatureType.STATE, tuple(config.action_feature.shape))
         config.input_features = {**(config.input_features or {}), BASE_ACTION: seen}
 

@@ -48,8 +48,7 @@ class CQNConfig(RLConfig):
     @cached_property
     def settings(self) -> CQNSettings:
         """The preset with this config's fields on top."""
-        given = {name: value for name, value in given_fields(self).items() if value is not None}
-        return resolve(CQNSettings, PRESETS, self.preset, self.correcting() | given)
+        return resolve(CQNSettings, PRESETS, self.preset, self.correcting() | given_fields(self))
 
     def correcting(self) -> dict[str, Any]:
         """Settings that follow from correcting another policy: it begins as that policy, and so without random bins."""

@@ -9,7 +9,6 @@ Shapes: K rows, D action dimensions.
 
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -205,8 +204,3 @@ class AddBaseActionProcessorStep(ProcessorStep):
     def transform_features(self, features: Any) -> Any:
         """Shapes and types stay."""
         return features
-
-
-def absolute(path: str) -> str:
-    """A folder's path as it is from anywhere; a name on the Hub stays."""
-    return str(Path(path).resolve()) if Path(path).exists() else path

@@ -99,10 +99,9 @@ class CQNModel(Model):
             q = self.q_values(logits[:, 0])  # [B, D, N]
             index = q.argmax(-1)
             if s.flat_bin == "middle":
-                index = torch.where(q.amax(-1) - q.amin(-1) < FLAT, s.bins // 2, index)
+                index = torch.where(_spread(q) < FLAT, s.bins // 2, index)
             if random_below > 0:
-                flat = (q.amax(-1) - q.amin(-1)) < random_below
-                index = torch.where(flat, torch.randint_like(index, s.bins), index)
+                index = torch.where(_spread(q) < random_below, torch.randint_like(index, s.bins), index)
             chosen.append(q.gather(-1, index[..., None])[..., 0])
             indices.append(index)
             low, high = zoom(low, high, index, s.bins)
@@ -201,3 +200,8 @@ class CQNModel(Model):
             total = total + s.bc_loss_scale * bc
         stats["loss"] = total.detach()
         return total, stats
+
+
+def _spread(q: Tensor) -> Tensor:
+    """Best minus worst over the bins, [B, D] from [B, D, N]."""
+    return q.amax(-1) - q.amin(-1)

@@ -29,10 +29,6 @@ class CQNASPolicy(RLPolicy):
         self._player: TemporalEnsemble | OpenLoop = ensemble or OpenLoop()
         self._q: Tensor | None = None  # of the newest sequence
 
-    def reset(self) -> None:
-        """Forget the frame history and all sequences; call at the start of each episode."""
-        super().reset()  # which forgets the plan, too
-
     def forget_plan(self) -> None:
         """Forget sequences that were chosen for a course which the episode did not take."""
         self._player.reset()

@@ -48,7 +48,7 @@ class ViewEncoder(nn.Module):
         plain: bool = False,
     ) -> None:
         super().__init__()
-        self.plain, self.whole = plain, norm == "picture"
+        self.plain, self.whole = plain, norm == "picture" and not plain
         sizes, strides = [in_channels, *channels], strides or [STRIDE] * len(channels)
         self.convolutions = nn.ModuleList(
             nn.Conv2d(a, b, kernel, stride, padding) for (a, b), stride in zip(pairwise(sizes), strides, strict=True)
@@ -73,7 +73,7 @@ class ViewEncoder(nn.Module):
     def forward(self, pixels: Tensor) -> Tensor:
         """[B, 3*S, H, W] float in [-0.5, 0.5] -> [B, out_features]."""
         for convolution, norm in zip(self.convolutions, self.norms, strict=True):
-            if self.whole and not self.plain:
+            if self.whole:
                 pixels = F.silu(norm(convolution(pixels)))
                 continue
             # Layer norm over the last axis of the channels-last view: no copy when memory is channels-last.

@@ -28,7 +28,7 @@ from lerobot.utils.constants import (
 )
 
 from .base_config import RLConfig
-from .correction import AddBaseActionProcessorStep, BaseActionProcessorStep, absolute
+from .correction import AddBaseActionProcessorStep, BaseActionProcessorStep
 from .errors import ConfigError, DataError
 from .fit_pictures import FitPicturesProcessorStep
 from .joint_goals import (
@@ -39,14 +39,12 @@ from .joint_goals import (
     undone_deltas,
 )
 from .scaling_check import check_scaling
-from .schema import BASE_ACTION, BOUND_PROCESSOR, dimension_names
+from .schema import BASE_ACTION, BOUND_PROCESSOR, dimension_names, opens_and_closes
 from .settings import CQNASSettings, CQNSettings
 
 __all__ = ["BoundObservationProcessorStep", "Stats", "make_processors", "scaling_stats"]
 
 Stats = dict[str, dict[str, Any]]
-
-HELD = ("grip", "jaw", "finger")  # parts of names of what opens and closes
 
 
 @ProcessorStepRegistry.register(name=BOUND_PROCESSOR)
@@ -178,7 +176,7 @@ def _correction_steps(
     Raises ConfigError without action bounds, and where the dataset's actions are differences that `cqn-data delta` made
     or undid: the base's are what the robot takes.
     """
-    s, path = config.settings, absolute(str(config.base_path))
+    s, path = config.settings, str(config.base_path)
     if not isinstance(s, CQNSettings) or isinstance(s, CQNASSettings):
         raise ConfigError("Corrections are for --policy.type=cqn: leave out --policy.base_path, or change the type.")
     if converted_deltas(meta) is not None or undone_deltas(meta) is not None:
@@ -190,7 +188,7 @@ def _correction_steps(
         raise ConfigError("Corrections are shares of the actions' range: give a dataset, or its statistics.")
     low, high = (np.asarray(stats[ACTION][end], np.float64).reshape(-1) for end in ("min", "max"))
     names = dimension_names(meta.features[ACTION]) if meta is not None else [str(i) for i in range(len(low))]
-    held = np.array([any(part in name.lower() for part in HELD) for name in names])
+    held = np.array([opens_and_closes(name) for name in names])
     reach = np.where(held, s.correction_gripper, s.correction_range) * (high - low)
     changed = {**stats, BASE_ACTION: stats[ACTION], ACTION: {"min": -reach, "max": reach}}
     ask = BaseActionProcessorStep(path, config.base_revision)

@@ -40,6 +40,7 @@ __all__ = [
     "Observation",
     "dimension_names",
     "has_names",
+    "opens_and_closes",
     "read_history",
 ]
 
@@ -129,6 +130,11 @@ def dimension_names(feature: Mapping[str, Any]) -> list[str]:
     if names is None:
         return [str(i) for i in range(prod(feature["shape"]))]
     return [n if names.count(n) == 1 else f"{n}#{i}" for i, n in enumerate(names)]
+
+
+def opens_and_closes(name: str) -> bool:
+    """Whether a dimension's name says that it is a gripper, jaws or fingers."""
+    return any(part in name.lower() for part in ("grip", "jaw", "finger"))
 
 
 def has_names(feature: Mapping[str, Any]) -> bool:

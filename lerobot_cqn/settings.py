@@ -225,8 +225,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-_LAPTOP_PIXELS: dict[str, Any] = {**PRESETS["laptop_pixels"], "v_min": -1.0, "v_max": 1.0, "n_step": 3}
-_LAPTOP_STATE: dict[str, Any] = {**PRESETS["laptop_state"], "v_min": -1.0, "v_max": 1.0, "n_step": 3}
+_LAPTOP: dict[str, Any] = {"v_min": -1.0, "v_max": 1.0, "n_step": 3, "sequence_fill": "mask"}
 CQN_AS_PRESETS: dict[str, dict[str, Any]] = {
     # The authors' configurations.
     "cqn_as_rlbench": {"bound_margin": 0.2},
@@ -241,8 +240,8 @@ CQN_AS_PRESETS: dict[str, dict[str, Any]] = {
         "act_with": "online", "sequence_fill": "last", "state_bound": 1e6,
     },
     # Ours: CQN's presets of the same names, with sequences; what lies beyond an episode's end is not learned from.
-    "laptop_state": {**_LAPTOP_STATE, "sequence_fill": "mask"},
-    "laptop_pixels": {**_LAPTOP_PIXELS, "sequence_fill": "mask"},
+    "laptop_state": {**PRESETS["laptop_state"], **_LAPTOP},
+    "laptop_pixels": {**PRESETS["laptop_pixels"], **_LAPTOP},
 }  # fmt: skip
 
 _DRQV2: dict[str, Any] = {"distributional": False, "exploration_noise": 0.2, "weight_decay": 0.0}

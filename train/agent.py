@@ -16,7 +16,7 @@ from lerobot.processor import (
 from numpy.typing import NDArray
 
 from lerobot_cqn.base_policy import RLPolicy
-from lerobot_cqn.correction import AddBaseActionProcessorStep, Base, absolute, base_of
+from lerobot_cqn.correction import AddBaseActionProcessorStep, Base, base_of
 from lerobot_cqn.delta_actions import DeltaJoints
 from lerobot_cqn.errors import DataError
 from lerobot_cqn.joint_goals import DeltaToGoalProcessorStep
@@ -81,7 +81,7 @@ class Agent:
     def base(self) -> Base | None:
         """The policy that this one corrects; None: none."""
         config = self.policy.config
-        return None if config.base_path is None else base_of(absolute(config.base_path), config.base_revision)
+        return None if config.base_path is None else base_of(config.base_path, config.base_revision)
 
     @property
     def _goal_steps(self) -> list[DeltaToGoalProcessorStep | AddBaseActionProcessorStep]:

@@ -52,15 +52,14 @@ class Recipe:
         return self.updates_per_episode if steps > self.random_steps else 0
 
 
+_REFERENCE_DMC = Recipe(update_interval=2, demo_batch_size=0, random_steps=2000, action_bounds="environment")
 # Of each policy preset (table 2 and the last table of the appendix); presets that are not here use the defaults.
 _RECIPES: dict[str, Recipe] = {
     "paper_real_world": Recipe(updates_per_step=0, updates_per_episode=50),
     "paper_dmc_state": Recipe(batch_size=512, demo_batch_size=0, action_bounds="environment"),
     "paper_dmc_pixels": Recipe(demo_batch_size=0, action_bounds="environment"),
-    "reference_dmc_state": Recipe(update_interval=2, demo_batch_size=0, random_steps=2000, action_bounds="environment"),
-    "reference_dmc_pixels": Recipe(
-        update_interval=2, demo_batch_size=0, random_steps=2000, action_bounds="environment"
-    ),
+    "reference_dmc_state": _REFERENCE_DMC,
+    "reference_dmc_pixels": _REFERENCE_DMC,
     "laptop_state": Recipe(batch_size=64, demo_batch_size=64),
     "laptop_pixels": Recipe(updates_per_step=0, updates_per_episode=25, batch_size=64, demo_batch_size=64),
     "practice_state": Recipe(updates_per_step=0, updates_per_episode=25, batch_size=64, demo_batch_size=64),

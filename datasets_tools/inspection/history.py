@@ -13,12 +13,10 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.schema import ACTION
 
-from ..disk.source import Source
 from .finding import Finding
-from .numbers import Numbers
-from .regression import courses, unexplained
+from .regression import Courses, unexplained
 
-__all__ = ["FRAMES", "STRIDES", "History", "history_finding", "measure_history", "stacked"]
+__all__ = ["FRAMES", "STRIDES", "History", "history_finding", "history_of", "stacked"]
 
 FRAMES, STRIDES = (1, 2, 4, 8), (1, 2, 4)
 FLOOR = 0.01  # share of an action's variance below which a difference is rounding
@@ -67,11 +65,8 @@ class History:
         return f"Of the actions' variance {', '.join(map(str, FRAMES))} frames of the state leave {shares} unexplained."
 
 
-def measure_history(source: Source, numbers: Numbers) -> History | None:
-    """Compare histories on the episodes that can be read; None with fewer than five, or where nothing varies."""
-    look = courses(source, numbers)
-    if look is None:
-        return None
+def history_of(look: Courses) -> History:
+    """Compare histories."""
     shares = {
         (frames, stride): unexplained([stacked(s, frames, stride) for s in look.states], look.actions)
         for frames in FRAMES

@@ -144,10 +144,11 @@ def inspect_dataset(repo_id: str, source: "Source", *, value_probe: bool = False
     from .cameras import look, missing_videos
     from .checks import Dataset, findings
     from .finding import by_level
-    from .history import history_finding, measure_history
+    from .history import history_finding, history_of
     from .numbers import measure
     from .places import order, timing
-    from .sequences import measure_sequences, sequence_finding
+    from .regression import courses
+    from .sequences import sequence_finding, sequences_of
     from .statistics import statistics
 
     missing = missing_videos(source)
@@ -166,9 +167,10 @@ def inspect_dataset(repo_id: str, source: "Source", *, value_probe: bool = False
         line = bar.add_task("Looking at pictures", total=len(source.cameras))
         cameras = look(source, numbers.episodes, moves, lambda: bar.advance(line))
         line = bar.add_task("Comparing histories", total=1)
-        history = measure_history(source, numbers)
+        seen = courses(source, numbers)
+        history = history_of(seen) if seen is not None else None
         bar.advance(line)
-        sequences = measure_sequences(source, numbers) if value_probe else None
+        sequences = sequences_of(seen) if value_probe and seen is not None else None
     if value_probe and sequences is None:
         note("Sequences cannot be compared: too few episodes of more than 16 steps, or all of one length.")
     try:

@@ -101,12 +101,14 @@ def _left_out(features: Array, y: Array, fold: NDArray[np.int64]) -> Iterator[Ar
     """(N, A) squared errors, each on the fold left out, for each penalty."""
     parts = [(features[fold == f], y[fold == f]) for f in range(FOLDS)]
     grams, products = [p.T @ p for p, _ in parts], [p.T @ t for p, t in parts]
+    others = [
+        tuple(sum(s for f, s in enumerate(sums) if f != held) for sums in (grams, products)) for held in range(FOLDS)
+    ]
     for penalty in PENALTIES:
         squares = np.zeros_like(y)
-        for held, (part, target) in enumerate(parts):
-            gram = sum(g for f, g in enumerate(grams) if f != held) + penalty * np.eye(features.shape[1])
-            product = sum(p for f, p in enumerate(products) if f != held)
-            squares[fold == held] = (part @ np.linalg.solve(gram, product) - target) ** 2
+        for held, ((part, target), (gram, product)) in enumerate(zip(parts, others, strict=True)):
+            weights = np.linalg.solve(gram + penalty * np.eye(features.shape[1]), product)
+            squares[fold == held] = (part @ weights - target) ** 2
         yield squares
 
 

@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 
 from lerobot_cqn.schema import ACTION
 
-from ..disk.source import Source
 from .finding import Finding
-from .numbers import Numbers
-from .regression import Courses, courses, residuals
+from .regression import Courses, residuals
 
-__all__ = ["LENGTHS", "Sequences", "measure_sequences", "noise_share", "sequence_finding", "sequences_of"]
+__all__ = ["LENGTHS", "Sequences", "noise_share", "sequence_finding", "sequences_of"]
 
 LENGTHS = (1, 4, 8, 16)
 DISCOUNT = 0.99  # of the policies' presets
@@ -81,14 +79,8 @@ class Sequences:
         )
 
 
-def measure_sequences(source: Source, numbers: Numbers) -> Sequences | None:
-    """Compare sequences; None where there are too few steps, or every episode is as long and ends alike."""
-    look = courses(source, numbers)
-    return None if look is None else sequences_of(look)
-
-
 def sequences_of(look: Courses) -> Sequences | None:
-    """The same on courses that are there already."""
+    """Compare sequences; None where there are too few steps, or every episode is as long and ends alike."""
     longest = max(LENGTHS)
     kept = [i for i, states in enumerate(look.states) if len(states) > longest]
     starts = {i: len(look.states[i]) - longest + 1 for i in kept}

@@ -134,7 +134,7 @@ class Demonstrations:
         judged = [key for key in REWARD_FEATURES if key in dataset.features]
         columns = dataset.hf_dataset.with_format("numpy")
         numbers = np.asarray(columns["episode_index"])
-        plain = [key for key in dict.fromkeys((*vectors_of, *needed)) if dataset.features[key]["dtype"] not in PICTURES]
+        plain = [key for key in needed if dataset.features[key]["dtype"] not in PICTURES]
         raw = {key: _column(columns, key) for key in dict.fromkeys((*plain, *judged))}
         _check_finite(raw, numbers)
         if not rewarded:
