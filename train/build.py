@@ -34,9 +34,9 @@ from .push.send import check_account
 from .replay.buffer import Replay
 from .replay.demonstrations import Demonstrations
 from .replay.episode import Episode
-from .run.beginning import BEGUN, beginning, forget_beginning
+from .run.beginning import BEGUN, PAGE, beginning, forget_beginning
 from .run.checkpoint import Counters, last_checkpoint, restore, save, seed_everything, stored_episodes
-from .run.durable import check_room
+from .run.durable import SpareDescriptors, check_room
 from .run.first_look import draw_batch, warnings_about
 from .run.metrics import Log, Metrics, start_tensorboard, start_wandb
 from .run.progress import Monitors
@@ -99,7 +99,7 @@ def build(
         sizes = (256, 256 if replay.demonstrations else 0)  # enough to have a reward among them
         draw_batch(replay.sample(*sizes, np.random.default_rng(config.seed)), picture)
         monitor.message(f"First batch: {picture}")
-    metrics = Metrics(run.output_dir, also_to(run, world.board))
+    metrics, spare = Metrics(run.output_dir, also_to(run, world.board)), stack.enter_context(SpareDescriptors())
     learner, counters = Learner(agent.policy.model), Counters()
     if checkpoint is not None:
         counters, tables = restore(checkpoint, learner, rng)
@@ -108,10 +108,12 @@ def build(
         monitor.message(f"Resuming at step {counters.env_steps}, {counters.updates} updates.")
 
     def save_checkpoint() -> None:
-        save(
-            run.output_dir, agent, learner, rng, counters, tables=metrics.sizes(), run_config=draccus.encode(config),
-            episodes=[place.number for place in replay.places if place.number >= 0],
-        )  # fmt: skip
+        with spare.given():
+            save(
+                run.output_dir, agent, learner, rng, counters, tables=metrics.sizes(),
+                run_config=draccus.encode(config),
+                episodes=[place.number for place in replay.places if place.number >= 0],
+            )  # fmt: skip
         begun.unlink(missing_ok=True)
 
     if world.board is not None:
@@ -120,7 +122,7 @@ def build(
     return Trainer(
         config=config, agent=agent, learner=learner, env=world.env, scenes=world.scenes, replay=replay,
         metrics=metrics, monitor=monitor, rng=rng, counters=counters, save=save_checkpoint, should_stop=should_stop,
-        finished_since=finished, person=world.person, clock=clock,
+        finished_since=finished, person=world.person, spare=spare, clock=clock,
     )  # fmt: skip
 
 
@@ -129,7 +131,8 @@ def check_outside(run: ValidRun, say: Callable[[str], None]) -> None:
     check_room(run.output_dir)
     if not run.config.resume:
         forget_beginning(run.output_dir)
-    if not run.config.resume and run.output_dir.exists() and any(run.output_dir.iterdir()):
+    made = {path.name for path in run.output_dir.iterdir()} if run.output_dir.is_dir() else set()
+    if not run.config.resume and (made - {PAGE} or run.output_dir.is_file()):
         raise OutputExistsError(
             f"{run.output_dir} exists and is not empty: give another --output_dir, or --resume=true to continue."
         )

@@ -68,6 +68,11 @@ def run(valid: ValidRun) -> int:
             trainer.save()
             monitor.message(f"Stopped. Continue with: cqn-train --resume=true --output_dir={valid.output_dir}")
             return 130
+        except OSError:  # of the machine (no descriptors left, a device gone): what was learned is sound
+            with contextlib.suppress(OSError):
+                trainer.save()
+                monitor.message(f"Saved. Continue with: cqn-train --resume=true --output_dir={valid.output_dir}")
+            raise
         monitor.message(f"Policy: {valid.output_dir}/checkpoints/last/pretrained_model")
         from .run.judgement import practice, read_tables
         from .run.report import write_report

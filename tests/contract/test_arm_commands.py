@@ -117,14 +117,17 @@ def test_online_with_a_person_killed_and_resumed(
         "cqn-train", "--resume=true", f"--output_dir={run}", f"--steps={int(before[-1]['env_steps']) + 30}",
         "--eval.final_n_episodes=1",
     )  # fmt: skip
-    assert "Operator's page: http://127.0.0.1" in done.stdout
+    assert f"Operator's page: http://127.0.0.1:{port}/ (with its token in {run}/page/address" in done.stdout
+    address = run / "page" / "address"  # which may be read by nobody else, unlike a log
+    assert address.stat().st_mode & 0o777 == 0o600
+    assert address.read_text() == f"http://127.0.0.1:{port}/?token=a-token-of-the-test\n"
     assert "Hz of 40" in done.stdout
     after = rows(run, "episodes")
     assert [int(row["episode"]) for row in after] == list(range(len(after)))
     assert len(after) > len(before)
     assert rows(run, "evaluations")[-1]["phase"] == "final"
     saved = (run / "checkpoints/last/pretrained_model/train_config.json").read_text()
-    assert "a-token-of-the-test" not in saved + done.stdout.replace("token=a-token-of-the-test", "")
+    assert "a-token-of-the-test" not in saved + done.stdout + done.stderr + log.read_text()
 
 
 @pytest.mark.parametrize(("options", "said"), [

@@ -1,7 +1,10 @@
 """`kill -9` at any moment of online training: what `--resume` finds and how it goes on."""
 
+import contextlib
+import itertools
 import os
 import random
+import resource
 import shutil
 import signal
 import time
@@ -12,8 +15,10 @@ from typing import Any
 import pytest
 
 from cqn_train.cli import main
+from cqn_train.loop.gym_env import GymEnvironment
 from cqn_train.replay.files import Journal, Place
 from cqn_train.run import checkpoint
+from cqn_train.run.checkpoint import last_checkpoint, stored_episodes
 from lerobot_cqn.errors import ConfigError
 
 from .conftest import TINY_RUN
@@ -162,8 +167,6 @@ def test_a_run_can_be_continued_from_its_offline_phase(
 def test_the_same_command_works_again_after_a_beginning_that_failed(
     click: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from cqn_train.loop.gym_env import GymEnvironment
-
     run = tmp_path / "run"
     options = [
         *TINY_RUN,
@@ -208,6 +211,41 @@ def test_a_nearly_full_disk_is_said_before_anything_is_written_and_ends_a_run_in
     monkeypatch.undo()
     assert main(["--resume=true", f"--output_dir={run}", "--eval.final_n_episodes=0"]) == 0
     assert [int(row["episode"]) for row in tables(run)["episodes"]][:2] == [0, 1]
+
+
+def test_without_descriptors_left_it_saves_what_it_has(
+    click: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A leak of somebody else's (a camera that is opened again and again) costs no episode and no update."""
+    run, taken = tmp_path / "run", list[int]()
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    step, steps = GymEnvironment.step, itertools.count()
+
+    def leaking(env: GymEnvironment, action: Any) -> Any:
+        if next(steps) == 40:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 50, before[1]))
+            with contextlib.suppress(OSError):
+                while True:
+                    taken.append(os.open(os.devnull, os.O_RDONLY))
+        return step(env, action)
+
+    monkeypatch.setattr(GymEnvironment, "step", leaking)
+    try:
+        code = main([*TINY_RUN, *click, "--save_freq=100000", "--eval.freq=0", f"--output_dir={run}"])
+    finally:
+        for number in taken:
+            os.close(number)
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert code == 2
+    assert "Too many open files" in capsys.readouterr().err
+    found = last_checkpoint(run).resolve()
+    assert int(found.name) > 0
+    finished = [place.number for _, place in Journal(run / "replay" / "episodes.jsonl").entries() if place is not None]
+    assert stored_episodes(found) >= {number for number in finished if number >= 0}
+    monkeypatch.undo()
+    assert main(["--resume=true", f"--output_dir={run}", "--eval.final_n_episodes=0"]) == 0
+    rows = [int(row["episode"]) for row in tables(run)["episodes"]]
+    assert rows == list(range(len(rows)))
 
 
 def test_a_damaged_replay_is_said_and_accepted_on_request(

@@ -354,6 +354,24 @@ def test_a_closed_page_pauses_sooner_and_one_that_is_loaded_anew_does_not(contro
     assert session.state is State.PAUSED
 
 
+@pytest.mark.parametrize("state", [State.WAITING, State.RESETTING])
+def test_an_arm_on_its_way_home_is_held_when_its_operator_is_gone(
+    control: Control, clock: DrivenClock, state: State
+) -> None:
+    session = running(control)
+    control.apply("ann", Event.SUCCESS)
+    session.learning("")
+    if state is State.WAITING:
+        control.apply("ann", Event.READY)
+    session.note_homing(True)
+    clock.now += 9
+    assert not control.check()
+    clock.now += 2
+    assert control.check()
+    assert (session.state, session.homing) == (state, False)
+    assert not control.check()
+
+
 def test_nobody_at_all_is_absent(clock: DrivenClock) -> None:
     session = Session()
     session.apply(Event.START)

@@ -224,6 +224,18 @@ def test_breaks_are_counted_once_each() -> None:
     assert made.breaks == 3
 
 
+@pytest.mark.parametrize("event", [Event.PAUSE, Event.ABSENT])
+@pytest.mark.parametrize("state", [State.WAITING, State.RESETTING])
+def test_on_its_way_home_an_arm_can_be_held_and_needs_somebody(event: Event, state: State) -> None:
+    made = session(state)
+    refused(made, event, "nothing moves")
+    made.note_homing(True)
+    assert made.moving
+    assert made.apply(event) is state
+    assert not made.homing
+    assert made.breaks == 0  # no episode was broken off
+
+
 def test_going_home_is_asked_once_and_forgotten_by_what_comes_next() -> None:
     for state in (State.WAITING, State.RESETTING):
         made = session(state)

@@ -33,6 +33,7 @@ from ..robot.arm import Arm, state_names
 from ..robot.guard import Guard, GuardSettings
 from ..robot.limits import Forward, Limits
 from ..robot.settings import ArmSettings
+from ..run.beginning import PAGE
 from ..run.metrics import read_rows
 from .environment import ArmEnvironment
 
@@ -114,8 +115,20 @@ def steering(config: RunConfig, operated: Operated, say: Callable[[str], None]) 
     page, token = config.page, os.environ.get(PAGE_TOKEN) or None
     certificate = _certificate(page, config.output_dir, say)
     with OperatorServer(operated.board, page.host, page.port, token, page.absent_s, certificate=certificate) as server:
-        say(f"Operator's page: {server.url}")
+        say(f"Operator's page: {_announced(server.url, config.output_dir)}")
         yield
+
+
+def _announced(url: str, output_dir: Path | None) -> str:
+    """The page's address for a person; without its token where it goes into a log, which others may read."""
+    if sys.stdout.isatty() or output_dir is None:
+        return url
+    path = output_dir / PAGE / "address"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)  # of an earlier run, whoever might read it
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+        file.write(url + "\n")
+    return f"{url.partition('?')[0]} (with its token in {path}, which only you can read)"
 
 
 def _certificate(page: PageSettings, output_dir: Path | None, say: Callable[[str], None]) -> Certificate | None:
@@ -125,7 +138,7 @@ def _certificate(page: PageSettings, output_dir: Path | None, say: Callable[[str
     if not page.tls or output_dir is None:
         return None
     hosts = ["localhost", "127.0.0.1", own_address(), *([] if page.host in ANY_ADDRESS else [page.host])]
-    made, fingerprint = own_certificate(output_dir / "page", hosts)
+    made, fingerprint = own_certificate(output_dir / PAGE, hosts)
     say(f"Certificate: {made[0]}, SHA-256 {fingerprint}; the browser shows the same before you trust it.")
     return made
 

@@ -24,7 +24,7 @@ from ..replay.episode import Episode
 from ..replay.files import Place
 from ..replay.recorder import Recorder
 from ..run.checkpoint import Counters
-from ..run.durable import check_room
+from ..run.durable import SpareDescriptors, check_room
 from ..run.first_look import save_batch, write_films
 from ..run.judgement import unconverged
 from ..run.metrics import Metrics, read_rows
@@ -56,6 +56,7 @@ class Trainer:
     save: Callable[[], None]
     should_stop: Callable[[], bool]
     person: Person
+    spare: SpareDescriptors
     evaluations: list[tuple[str, Evaluation]] = field(default_factory=list)
     finished_since: Sequence[Place] = ()
     _aside: dict[int, tuple[Episode, dict[str, Any]]] = field(default_factory=dict)
@@ -113,7 +114,7 @@ class Trainer:
             before, number, began, waited = c.env_steps, c.episodes, self.clock.now, self.env.waited_s
             try:
                 self.episode()
-            except Interrupted:  # the unfinished episode is dropped, so its steps do not count either
+            except (Interrupted, OSError):  # the unfinished episode is dropped, so its steps do not count either
                 c.env_steps = before if c.episodes == number else c.env_steps
                 raise
             self._correct()
@@ -174,7 +175,8 @@ class Trainer:
                 ended = True
         finally:
             if ended:  # also where the learner beside it failed: the person's work is not lost
-                self._store(recorder, outcome, np.array(values))
+                with self.spare.given():
+                    self._store(recorder, outcome, np.array(values))
 
     def _store(self, recorder: Recorder, outcome: Outcome, values: NDArray[Any]) -> None:
         """Keep a finished episode and say how it went."""

@@ -8,7 +8,7 @@ from typing import Any
 from lerobot_cqn.errors import CQNError
 
 from ..clock import REAL, Clock
-from .session import BY_ITSELF, IN_MOTION, Event, Label, RefusedError, Session, State
+from .session import BY_ITSELF, Event, Label, RefusedError, Session, State
 
 __all__ = ["Control", "ViewingOnlyError"]
 
@@ -97,7 +97,7 @@ class Control:
 
     def check(self) -> bool:
         """Pause the session where the arm moves and nobody is there; to be called often. True: it did."""
-        if self._session.state not in IN_MOTION or self.present():
+        if not self._session.moving or self.present():
             return False
         return self.pause("Nobody is at the operator's page: the arm pauses.")
 

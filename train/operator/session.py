@@ -68,7 +68,7 @@ _ALWAYS = {Event.STOP: State.STOPPED, Event.FAULT: State.FAULTED}
 TRANSITIONS: Mapping[State, Mapping[Event, State]] = {
     State.WAITING: {
         **_ALWAYS, Event.START: State.RUNNING, Event.HOME: State.WAITING, Event.FREE: State.WAITING,
-        Event.PAUSE: State.WAITING,
+        Event.PAUSE: State.WAITING, Event.ABSENT: State.WAITING,
     },
     State.RUNNING: {
         **_ALWAYS, **_ENDS, Event.PAUSE: State.PAUSED, Event.ABSENT: State.PAUSED,
@@ -82,7 +82,7 @@ TRANSITIONS: Mapping[State, Mapping[Event, State]] = {
     State.LABELLING: {**_ALWAYS, **_ENDS},
     State.RESETTING: {
         **_ALWAYS, Event.READY: State.WAITING, Event.HOME: State.RESETTING, Event.FREE: State.RESETTING,
-        Event.PAUSE: State.RESETTING,
+        Event.PAUSE: State.RESETTING, Event.ABSENT: State.RESETTING,
     },
     # What was going on is over; where an episode was, a person says how it went (see `Session.apply`).
     State.FAULTED: {**_ALWAYS, Event.RECOVERED: State.RESETTING, Event.FREE: State.FAULTED},
@@ -182,6 +182,12 @@ class Session:
                 self._corrected[episode] = label
                 self.on_change(self)
 
+    @property
+    def moving(self) -> bool:
+        """Whether the arm moves: in an episode, or on its way home."""
+        with self._lock:
+            return self.state in IN_MOTION or self.homing
+
     def take_corrected(self) -> dict[int, Label]:
         """Labels that were changed since the last call, for whoever learns from them."""
         with self._lock:
@@ -237,7 +243,7 @@ class Session:
         """Reason, for people, against an event that the state allows; "" where there is none."""
         if event is Event.START and self.busy:
             return f"An episode cannot start while the learner is busy ({self.busy}): wait for it."
-        if event is Event.PAUSE and self.state in (State.WAITING, State.RESETTING) and not self.homing:
+        if event in (Event.PAUSE, Event.ABSENT) and not self.moving:
             return f"'{event}' has no place while {self.state}: nothing moves."
         if event is Event.TAKE_OVER and self.evaluating:
             return "An evaluation is on: the policy must do it alone; discard it, or wait."

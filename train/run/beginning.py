@@ -11,10 +11,11 @@ from lerobot_cqn.errors import OutputExistsError
 
 from .metrics import COLUMNS
 
-__all__ = ["BEGUN", "beginning", "forget_beginning"]
+__all__ = ["BEGUN", "PAGE", "beginning", "forget_beginning"]
 
 BEGUN = ".begun"  # in the run's folder, locked by the process that begins it
-MADE = ("replay", "checkpoints", "tensorboard", "first_batch.png", *(f"{table}.csv" for table in COLUMNS), BEGUN)
+PAGE = "page"  # certificate and address of the operator's page, made before anything else
+MADE = ("replay", "checkpoints", PAGE, "tensorboard", "first_batch.png", *(f"{table}.csv" for table in COLUMNS), BEGUN)
 
 
 @contextlib.contextmanager
