@@ -38,6 +38,7 @@ from .joint_goals import (
     converted_deltas,
     undone_deltas,
 )
+from .rows_check import check_rows
 from .scaling_check import check_scaling
 from .schema import BASE_ACTION, BOUND_PROCESSOR, dimension_names, opens_and_closes
 from .settings import CQNASSettings, CQNSettings
@@ -125,6 +126,7 @@ def make_processors(
     features: dict[str, PolicyFeature] = {**(config.input_features or {}), **(config.output_features or {})}
     if meta is not None and ACTION in meta.features:
         bound = config.settings.state_bound if OBS_STATE in features else None
+        check_rows(meta)
         check_scaling(stats, meta, margin=margin, state_bound=bound)
     ask: list[ProcessorStep] = []
     add: list[ProcessorStep] = []

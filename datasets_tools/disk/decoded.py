@@ -3,17 +3,18 @@
 Shapes: H, W pixels of a picture.
 """
 
+import threading
 from dataclasses import dataclass
 from typing import Any
 
 import av
-import cv2
 import numpy as np
+from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 
 from ..views.episode import Camera
 
-__all__ = ["Colours", "Decoded", "Handed"]
+__all__ = ["Coded", "Colours", "Decoded", "Handed"]
 
 # Formats of 8 bits whose planes can be scaled one by one, and the one of each without halved colour planes.
 PLANAR = {
@@ -48,6 +49,14 @@ class Colours:
 
 
 @dataclass(frozen=True)
+class Coded:
+    """A picture's bytes in its file, complete behind those of the picture before it, or by themselves where ``key``."""
+
+    data: bytes
+    key: bool
+
+
+@dataclass(frozen=True)
 class Decoded:
     """One picture of a video.
 
@@ -58,12 +67,15 @@ class Decoded:
             prediction, so that slow motion stands still and then jumps; only a picture that was predicted from the same
             neighbour, in the same size and quality, keeps its motion when it is predicted again.
         measured: it counts in the statistics.
+        coded: its bytes, where they may follow those of the picture that was handed on before it: they need not be
+            encoded again.
     """
 
     frame: av.VideoFrame
     colours: Colours
     key: bool = True
     measured: bool = True
+    coded: Coded | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -72,26 +84,17 @@ class Decoded:
 
     def rgb(self) -> NDArray[np.uint8]:
         """(H, W, 3) uint8, as LeRobot decodes it."""
-        return np.asarray(self.frame.to_ndarray(format="rgb24"), np.uint8)
+        return np.asarray(_SCALERS.colour.reformat(self.frame, format="rgb24").to_ndarray(), np.uint8)
 
     def shaped(self, camera: Camera) -> "Decoded":
-        """Cut out and scaled, plane by plane; the area filter when shrinking, linear when growing."""
+        """Cut out and scaled in its own numbers; the area filter when shrinking, linear when growing."""
         if camera.crop is None and camera.size in (None, self.size):
             return self
-        top, left, height, width = camera.crop or (0, 0, *self.size)
         frame = self.frame if self.frame.format.name in PLANAR else self.frame.reformat(format="yuv444p")
-        name = frame.format.name
-        halves = [_halves(frame, plane) for plane in frame.planes]
-        if any(n % h or m % v for h, v in halves for n, m in ((left, top), (width, height))):
-            frame = frame.reformat(format=PLANAR[name])
-        rows, columns = camera.size or (height, width)
-        target = av.VideoFrame(columns, rows, name)
-        for source, made in zip(frame.planes, target.planes, strict=True):
-            across, down = _halves(frame, source)
-            part = _pixels(source)[top // down : (top + height) // down, left // across : (left + width) // across]
-            shrinks = made.height <= part.shape[0] and made.width <= part.shape[1]
-            filtered = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-            _pixels(made)[:] = cv2.resize(np.ascontiguousarray(part), (made.width, made.height), interpolation=filtered)
+        name, part = frame.format.name, frame if camera.crop is None else _cut(frame, *camera.crop)
+        rows, columns = camera.size or (part.height, part.width)
+        shrinks = rows <= part.height and columns <= part.width
+        target = _SCALERS.size.reformat(part, columns, rows, name, interpolation="AREA" if shrinks else "BILINEAR")
         target.colorspace, target.color_range = frame.colorspace, frame.color_range
         return Decoded(target, self.colours, measured=self.measured)
 
@@ -107,6 +110,31 @@ class Handed(np.ndarray[Any, np.dtype[np.uint8]]):
         handed = np.broadcast_to(np.uint8(0), (*picture.size, 3)).view(cls)
         handed.picture = picture
         return handed
+
+
+def _cut(frame: av.VideoFrame, top: int, left: int, height: int, width: int) -> av.VideoFrame:
+    """A part of a picture; where it begins between two colours, each pixel has one of its own."""
+    halves = [_halves(frame, plane) for plane in frame.planes]
+    if any(n % h or m % v for h, v in halves for n, m in ((left, top), (width, height))):
+        frame = frame.reformat(format=PLANAR[frame.format.name])
+    part = av.VideoFrame(width, height, frame.format.name)
+    for source, made in zip(frame.planes, part.planes, strict=True):
+        across, down = _halves(frame, source)
+        _pixels(made)[:] = _pixels(source)[
+            top // down : (top + height) // down, left // across : (left + width) // across
+        ]
+    part.colorspace, part.color_range = frame.colorspace, frame.color_range
+    return part
+
+
+class _Scalers(threading.local):
+    """FFmpeg's scalers, one set a thread: each keeps what it made ready for pictures like the last one."""
+
+    def __init__(self) -> None:
+        self.size, self.colour = VideoReformatter(), VideoReformatter()
+
+
+_SCALERS = _Scalers()
 
 
 def _halves(frame: av.VideoFrame, plane: Any) -> tuple[int, int]:

@@ -118,7 +118,8 @@ def _encode(
     _refuse_unknown_kinds(source)
     features = {k: {n: v for n, v in f.items() if n != "info"} for k, f in all_features(view).items()}
     encoder = _encoder(source, crf)
-    kept_as_is = {k for k in view.cameras if view.cameras[k] == Camera() and _encoded_alike(source, k, encoder)}
+    unchanged = {k for k in view.cameras if view.cameras[k] == Camera() and _settings_of(source, k) == encoder}
+    alike = {k for k in unchanged if _says_all(source, k)}
     _note_losses(source)
     line = bar.add_task("Writing frames", total=sum(lengths.values()))
     writer = new_dataset(
@@ -128,7 +129,7 @@ def _encode(
         kept: list[int] = []
         for index in view.episodes:
             try:
-                for frame, task in _frames(view, index, kept_as_is):
+                for frame, task in _frames(view, index, alike, copied=unchanged if crf is None else set()):
                     target.add(frame, task)
                     bar.advance(line)
                 target.save_episode()
@@ -147,15 +148,22 @@ def _encode(
     return done
 
 
-def _frames(view: View, index: int, alike: set[str]) -> Iterator[tuple[dict[str, Any], str]]:
-    """The steps of an episode as LeRobot frames; ``alike``: cameras whose pictures are encoded as they were."""
+def _frames(view: View, index: int, alike: set[str], copied: set[str]) -> Iterator[tuple[dict[str, Any], str]]:
+    """The steps of an episode as LeRobot frames.
+
+    alike: cameras whose pictures are encoded as they were; copied: those whose bytes are taken over where they can be.
+    """
     episode, columns = view.episode(index), traced_columns(view, index)
     rows, measured = np.arange(len(episode)), set(sample_indices(len(episode)))
     for row, pictures in enumerate(view.camera_frames(episode, rows, decoded=True)):
         for key, picture in pictures.items():
             if isinstance(picture, Decoded):
-                key_frame = picture.key or key not in alike
-                pictures[key] = dataclasses.replace(picture, key=key_frame, measured=row in measured)
+                pictures[key] = dataclasses.replace(
+                    picture,
+                    key=picture.key or key not in alike,
+                    measured=row in measured,
+                    coded=picture.coded if key in copied else None,
+                )
         yield {**{k: v[row] for k, v in columns.items()}, **pictures}, episode.tasks[row]
 
 
@@ -194,13 +202,19 @@ def _encoder(source: Source, crf: int | None) -> RGBEncoderConfig | None:
     return None
 
 
-def _encoded_alike(source: Source, key: str, encoder: RGBEncoderConfig | None) -> bool:
-    """Whether the source says how a video was encoded, and the new one is encoded in the same way."""
-    if encoder is None or key not in source.meta.video_keys:
-        return False
+def _settings_of(source: Source, key: str) -> RGBEncoderConfig | None:
+    """How a camera's video was encoded, as far as the source says it; None without a video that can be encoded here."""
+    try:
+        info = source.meta.features[key].get("info") or {}
+        return RGBEncoderConfig.from_video_info(info) if key in source.meta.video_keys else None
+    except ValueError:
+        return None
+
+
+def _says_all(source: Source, key: str) -> bool:
+    """Whether the source says of a video all that its quality depends on."""
     info = source.meta.features[key].get("info") or {}
-    said = all(info.get(f"video.{name}") is not None for name in ("codec", "pix_fmt", "g", "crf"))
-    return said and RGBEncoderConfig.from_video_info(info) == encoder
+    return all(info.get(f"video.{name}") is not None for name in ("codec", "pix_fmt", "g", "crf"))
 
 
 def _codec(info: dict[str, Any]) -> dict[str, Any]:

@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 from lerobot_cqn.errors import DataError
 
 from ..views.episode import Camera
-from .decoded import Colours, Decoded
+from .decoded import Coded, Colours, Decoded
 
 __all__ = ["picture_size", "shaped", "video_pictures"]
+
+AV1 = ("libdav1d", "av1", "libaom-av1")  # FFmpeg's names of its decoders
+SEQUENCE_HEADER, TEMPORAL_DELIMITER = 1, 2  # AV1 bitstream specification, 6.2.2
 
 type Picture = NDArray[np.uint8]
 
@@ -53,16 +56,17 @@ def video_pictures(
             if stream.time_base is None:
                 raise ValueError("the video has no time base")
             container.seek(max(0, int((times[0] - 0.5 / fps) / stream.time_base)), stream=stream)
-            colours, follows = Colours.of(stream.codec_context), False
-            for frame in container.decode(stream):
+            colours, follows, joined = Colours.of(stream.codec_context), False, False
+            for frame, coded in _with_bytes(container, stream):
                 if frame.time is None or frame.time < times[position] - 0.5 / fps:
-                    follows = False
+                    follows = joined = False
                     continue
-                before = position
+                before, joins = position, coded is not None and (coded.key or joined)
                 while position < len(times) and abs(frame.time - times[position]) < 0.5 / fps:
-                    position += 1
-                    yield Decoded(frame, colours, key=bool(frame.key_frame) or not follows)
-                follows = position > before
+                    first, position = position == before, position + 1
+                    key = bool(frame.key_frame) or not follows
+                    yield Decoded(frame, colours, key=key, coded=coded if joins and first else None)
+                follows, joined = position > before, joins and position == before + 1
                 if position == len(times):
                     return
                 if frame.time > times[position] + 0.5 / fps:
@@ -71,6 +75,28 @@ def video_pictures(
     except (av.error.FFmpegError, OSError, ValueError, IndexError) as error:
         reason = " ".join(str(error).split())[:160]
     raise DataError(f"Video {path} cannot be read at episode {episode}, frame {int(frames[position])}: {reason}")
+
+
+def _with_bytes(container: Any, stream: Any) -> Iterator[tuple[Any, Coded | None]]:
+    """Decoded pictures with their bytes in the file, which are kept of AV1: there one packet is one picture."""
+    if stream.codec_context.name not in AV1:
+        yield from ((frame, None) for frame in container.decode(stream))
+        return
+    coded: dict[int | None, Coded | None] = {}
+    for packet in container.demux(stream):
+        if packet.size:
+            data = bytes(packet)
+            # A sequence header in front makes a key frame independent of what the file says of itself.
+            whole = not packet.is_keyframe or _kind(data) == SEQUENCE_HEADER
+            coded[packet.pts] = Coded(data, packet.is_keyframe) if whole else None
+        for frame in packet.decode():
+            yield frame, coded.pop(frame.pts, None)
+
+
+def _kind(data: bytes) -> int:
+    """Type of the first unit (OBU) of an AV1 packet, behind a temporal delimiter (AV1 bitstream specification, 5.3)."""
+    start = 2 if (data[0] >> 3 & 15) == TEMPORAL_DELIMITER else 0
+    return data[start] >> 3 & 15
 
 
 def shaped(picture: Picture, camera: Camera) -> Picture:

@@ -41,7 +41,7 @@ def load_lerobot() -> None:
         import av
         import lerobot.datasets.lerobot_dataset  # noqa: F401
     if _state["quiet"]:
-        av.logging.set_libav_level(av.logging.ERROR)
+        av.logging.set_libav_level(av.logging.PANIC)  # what cannot be read is said by file, episode and frame
 
 
 def note(message: str) -> None:

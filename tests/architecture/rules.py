@@ -22,7 +22,16 @@ ROOM_MAY_USE: dict[str, tuple[str, ...]] = {
     "lerobot_cqn._plugin": ("train.envs", "train.sim_arm"),
     "datasets_tools": tuple(
         f"lerobot_cqn.{name}"
-        for name in ["errors", "ranges", "schema", "delta_actions", "hub_retry", "history_text", "scaling_check"]
+        for name in [
+            "errors",
+            "ranges",
+            "schema",
+            "delta_actions",
+            "hub_retry",
+            "history_text",
+            "scaling_check",
+            "rows_check",
+        ]
     ),
     "train": ("lerobot_cqn", "datasets_tools"),
 }
@@ -35,7 +44,7 @@ FLOORS: dict[str, str] = {
     "lerobot_cqn": (
         "errors schema|ranges discretisation|distributional|augmentation|n_step losses settings networks model "
         "critic|actor_critic|learner sequence delta_actions|scaling_check "
-        "joint_goals|fit_pictures|history_text|hub_retry|correction base_config model_card|processors base_policy "
+        "rows_check|joint_goals|fit_pictures|history_text|hub_retry|correction base_config model_card|processors base_policy "
         "configuration_cqn|configuration_drqv2 configuration_cqn_as "
         "processor_cqn|processor_cqn_as|processor_drqv2 modeling_cqn|modeling_cqn_as|modeling_drqv2"
     ),

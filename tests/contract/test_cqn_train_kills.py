@@ -90,7 +90,7 @@ def kill_in_phases(run: Path, arguments: list[str], processes: Zygote, phases: l
         return path.read_bytes().count(what) if path.is_file() else 0
 
     numbers = 0
-    process = processes.start("cqn-train", *arguments, err=str(log))
+    process = processes.start("cqn-train", *arguments, out=str(log.with_name("said.txt")), err=str(log))
     for phase in phases:
         before = lines(journal.path, b'{"episode"'), lines(evaluations, b"\n")
         there = {
@@ -109,7 +109,7 @@ def kill_in_phases(run: Path, arguments: list[str], processes: Zygote, phases: l
         assert len(found) >= numbers, "a finished episode is gone"
         numbers = len(found)
         again = ["--resume=true", f"--output_dir={run}"] if last.exists() else arguments
-        process = processes.start("cqn-train", *again, err=str(log))
+        process = processes.start("cqn-train", *again, out=str(log.with_name("said.txt")), err=str(log))
     wait_until(last.exists)
     processes.kill(process)
     assert main(["--resume=true", f"--output_dir={run}", "--steps=1"]) == 0

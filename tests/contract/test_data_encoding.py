@@ -36,7 +36,8 @@ def record(root, pictures, codec="libsvtav1", still=1, **encoder):
         rgb_encoder=RGBEncoderConfig(vcodec=codec, **encoder),
     )  # fmt: skip
     for step, picture in enumerate(pictures):
-        state = np.array([0.1 * max(step - still, 0), 0], np.float32)
+        rest = still if isinstance(still, int) else still[step]  # steps so far in which the arm stood still
+        state = np.array([0.1 * max(step - rest, 0), 0], np.float32)
         dataset.add_frame({"observation.state": state, "action": state + np.float32(0.05), TOP: picture, "task": "go"})
     dataset.save_episode()
     dataset.finalize()
@@ -105,6 +106,50 @@ def test_slow_motion_does_not_stand_still(moving, tmp_path, operation, scaled):
     assert (changes(got) < FROZEN * changes(wanted)).sum() == 0
     assert np.abs(got - wanted).mean() < 12
     assert abs(brightness(got) - brightness(wanted)) < 0.6
+
+
+@pytest.mark.parametrize("g", [2, 5, 30])
+@pytest.mark.parametrize("seed", range(3))
+def test_whatever_is_cut_out_of_av1_the_rest_is_the_source_wherever_it_can_be(tmp_path, seed, g):
+    """Pictures whose bytes are taken over are the source's to the last bit; read one by one as well, in any order."""
+    steps, rng = 60, np.random.default_rng(seed)
+    still = rng.random(steps) < 0.15
+    root = record(tmp_path / "src", film(steps=steps), still=np.cumsum(still), g=g)
+    run("filter", root, tmp_path / "dst", "--threshold=0.01")
+    kept = column(tmp_path / "dst", "source.frame_index")
+    assert 0 < len(kept) < steps
+    wanted, got = seen(root)[kept], seen(tmp_path / "dst")
+    differences = np.abs(got - wanted).mean(axis=(1, 2, 3))
+    assert (changes(got) < FROZEN * changes(wanted)).sum() == 0
+    assert differences.max() < 8
+    # A picture follows the one before it in the source, back to a key frame, or was encoded anew.
+    whole = [all(frame - back in kept for back in range(frame % g + 1)) for frame in kept]
+    np.testing.assert_array_equal(differences == 0, whole)
+    assert sum(whole) > (5 if g < 30 else 0)
+    dataset = LeRobotDataset("local/dst", root=tmp_path / "dst")
+    for row in rng.permutation(len(kept))[:15]:
+        picture = 255 * np.asarray(dataset[int(row)][TOP]).transpose(1, 2, 0)
+        np.testing.assert_allclose(picture, got[row], atol=1.01)
+
+
+def test_a_damaged_video_is_one_line_on_the_terminal(tmp_path, command):
+    """Decoders would add their own, which nobody can read."""
+    root = record(tmp_path / "src", film())
+    path = next((root / "videos").rglob("*.mp4"))
+    data = bytearray(path.read_bytes())
+    for place in range(len(data) // 3, 2 * len(data) // 3, 37):
+        data[place] ^= 0xFF
+    path.write_bytes(data)
+    names = ["--repo_id=local/src", f"--root={root}", "--new_repo_id=local/dst", f"--new_root={tmp_path / 'dst'}"]
+    (line,) = command("cqn-data", "trim", *names, "--head=1", code=2).stderr.strip().splitlines()
+    assert line.startswith(f"cqn-data trim: error: Video {path} cannot be read at episode 0, frame ")
+
+
+def test_a_quality_that_is_asked_for_is_that_of_every_picture(tmp_path):
+    root = record(tmp_path / "src", film(), crf=10)
+    run("trim", root, tmp_path / "dst", "--head=2", "--crf=50")
+    wanted, got = seen(root)[2:], seen(tmp_path / "dst")
+    assert (np.abs(got - wanted).mean(axis=(1, 2, 3)) > 0).all()
 
 
 def test_slow_motion_of_a_film_whose_quality_nobody_wrote_down_stays(tmp_path):

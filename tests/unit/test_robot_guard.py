@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cqn_train.robot.guard import Guard, GuardSettings, StoppedError
+from cqn_train.robot.guard import LATE, Guard, GuardSettings, StoppedError
 from cqn_train.robot.limits import Limits, allowed_goal
 from cqn_train.robot.readings import RobotFault
 from lerobot_cqn.errors import ConfigError
@@ -203,6 +203,27 @@ def test_drivers_errors_become_one_kind(error: Exception) -> None:
     motors.on_send = lambda: None
     guard.close()
     assert not motors.is_connected
+
+
+@pytest.mark.parametrize("late", [1, LATE - 1, LATE])
+def test_the_first_readings_may_take_long(late: int) -> None:
+    """Cameras warm up, and nothing moves yet; once something does, one late reading is a fault."""
+    motors, clock, left = Motors(), DrivenClock(0.0), iter(range(late))
+    guard = Guard(motors, limits(), GuardSettings(current_s=0.3), clock)  # type: ignore[arg-type]
+
+    def slow(_: Any) -> None:
+        clock.now += 1.2 if next(left, None) is not None else 0.0
+
+    motors.on_read = slow
+    motors.connect()
+    if late == LATE:
+        with pytest.raises(RobotFault, match=r"took 1\.2 s"):
+            guard.read()
+        return
+    guard.read()
+    left = iter(range(1))
+    with pytest.raises(RobotFault, match=r"took 1\.2 s"):
+        guard.read()
 
 
 def test_readings_that_cannot_be_true() -> None:

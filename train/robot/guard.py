@@ -15,13 +15,23 @@ from lerobot_cqn.errors import CQNError
 from ..clock import REAL, Clock
 from .connection import connect, reconnect, reconnect_cameras
 from .limits import Limits, allowed_goal
-from .readings import Agreement, Contents, LostError, Reading, RobotFault, Whereabouts, WrongReadingError
+from .readings import (
+    Agreement,
+    Contents,
+    LateReadingError,
+    LostError,
+    Reading,
+    RobotFault,
+    Whereabouts,
+    WrongReadingError,
+)
 
 __all__ = ["Guard", "GuardSettings", "HeldError", "StoppedError"]
 
 Array = NDArray[np.float64]
 WRONG = 3  # readings in a row that cannot be true: a fault; fewer are read again
 AGAIN_S = 0.005  # between them: the same answer of a bus is not read twice
+LATE = 5  # readings that take too long, where nothing moves yet: cameras warm up
 ASKED = 12  # readings until enough agree, where nothing is known yet
 APART_S = 0.05  # between them: a glitch is shorter
 
@@ -141,14 +151,16 @@ class Guard:
         """A reading that several in a row agree with: where the arm is, when nothing is known of it."""
         self._trusted = False
         agreement = Agreement(self.names, self._whereabouts.slack / 2)
+        late = 0
         for asked in range(ASKED):
             if asked:
                 self._clock.sleep(APART_S)
             try:
                 settled = agreement.add(self._look())
-            except WrongReadingError:
+            except (WrongReadingError, LateReadingError) as error:
                 self._count("wrong reading")
-                if asked == ASKED - 1:
+                late += isinstance(error, LateReadingError)
+                if asked == ASKED - 1 or late == LATE:
                     raise
                 continue
             if settled is not None:
@@ -169,7 +181,9 @@ class Guard:
             raise LostError(f"The robot cannot be read: {error} Check cables and power.") from error
         took = self._clock.now - begun
         if took > self.settings.current_s:
-            raise RobotFault(f"Reading the robot took {took:.1f} s, expected at most {self.settings.current_s:g} s.")
+            raise LateReadingError(
+                f"Reading the robot took {took:.1f} s, expected at most {self.settings.current_s:g} s."
+            )
         reading = self._contents.take(raw, begun)
         self._check_fresh(reading.joints, reading.pictures, begun + took)
         return reading

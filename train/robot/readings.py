@@ -12,7 +12,16 @@ from lerobot_cqn.errors import CQNError
 
 from .limits import Limits
 
-__all__ = ["Agreement", "Contents", "LostError", "Reading", "RobotFault", "Whereabouts", "WrongReadingError"]
+__all__ = [
+    "Agreement",
+    "Contents",
+    "LateReadingError",
+    "LostError",
+    "Reading",
+    "RobotFault",
+    "Whereabouts",
+    "WrongReadingError",
+]
 
 Array = NDArray[np.float64]
 Pictures = Mapping[str, NDArray[np.uint8]]
@@ -29,6 +38,10 @@ class RobotFault(CQNError, RuntimeError):  # noqa: N818  # what people call it
 
 class LostError(RobotFault):
     """The driver says that the robot cannot be read: it is gone, or a part of it."""
+
+
+class LateReadingError(RobotFault):
+    """A reading that took too long to be where the arm is now."""
 
 
 class WrongReadingError(RobotFault):

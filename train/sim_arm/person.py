@@ -14,6 +14,7 @@ __all__ = ["SimPerson"]
 
 LOOK_S = 0.03
 RETRY_S = 0.2
+LOST_S = 3.0  # simulated seconds after which an arm that does not set off for home by itself is sent there
 SURE_S = 0.2  # simulated seconds for which the task must look done
 
 
@@ -64,7 +65,9 @@ class SimPerson:
         elif self._done_at < 0:
             self._done_at = world.now
         done = self._done_at >= 0 and world.now - self._done_at >= SURE_S
-        event = self._answer(state, done, world.now - self._since, int(session["episode"]))
+        seconds = world.now - self._since
+        lost = state in ("resetting", "waiting") and world.away and not session["homing"] and seconds > LOST_S
+        event = "home" if lost else self._answer(state, done, seconds, int(session["episode"]))
         if event and event in session["allowed"]:
             self._ask("/api/event", {"event": event})
 
