@@ -25,7 +25,7 @@ def check_rows(meta: Any) -> None:
     Raises DataError naming the first episode for which that is not so, or a data file that cannot be read.
     """
     episodes, frames, times = (_column(meta.root, key) for key in ("episode_index", "frame_index", "timestamp"))
-    if len(frames) != meta.total_frames:
+    if not len(frames) or len(frames) != meta.total_frames:
         return
     firsts, lasts = (np.asarray(meta.episodes[f"dataset_{end}_index"]) for end in ("from", "to"))
     for number, first, last, length in zip(

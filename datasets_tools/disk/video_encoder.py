@@ -167,8 +167,8 @@ class _Levels:
 
     def add(self, picture: NDArray[np.uint8]) -> None:
         """Count a picture (H, W, 3), or what LeRobot looks at of a large one."""
-        for counts, colour in zip(self._counts, auto_downsample_height_width(picture.transpose(2, 0, 1)), strict=True):
-            counts += np.bincount(colour.ravel(), minlength=256)
+        for number, colour in enumerate(auto_downsample_height_width(picture.transpose(2, 0, 1))):
+            self._counts[number] += np.bincount(colour.ravel(), minlength=256)
 
     def statistics(self) -> dict[str, NDArray[Any]]:
         """LeRobot's statistics (3,) of what was counted, in levels."""

@@ -44,7 +44,8 @@ FLOORS: dict[str, str] = {
     "lerobot_cqn": (
         "errors schema|ranges discretisation|distributional|augmentation|n_step losses settings networks model "
         "critic|actor_critic|learner sequence delta_actions|scaling_check "
-        "rows_check|joint_goals|fit_pictures|history_text|hub_retry|correction base_config model_card|processors base_policy "
+        "rows_check|joint_goals|fit_pictures|history_text|hub_retry|correction base_config model_card|processors "
+        "base_policy "
         "configuration_cqn|configuration_drqv2 configuration_cqn_as "
         "processor_cqn|processor_cqn_as|processor_drqv2 modeling_cqn|modeling_cqn_as|modeling_drqv2"
     ),
@@ -53,7 +54,7 @@ FLOORS: dict[str, str] = {
     ),
     "train": (
         "interfaces|clock envs|robot|operator sim_arm|config agent replay run loop arm "
-        "push|arguments build cli|bench|demo"
+        "push|arguments|virtual_so101 build cli|bench|demo"
     ),
 }
 

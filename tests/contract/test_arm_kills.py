@@ -39,7 +39,8 @@ def session(
         "--robot.type=sim_ur5e", "--robot.state=true", "--robot.speed=8",
         f"--robot.person=http://127.0.0.1:{port}", "--teleop.type=sim_leader", "--dataset.repo_id=local/cqn",
         f"--dataset.root={tmp_path / 'cqn'}", f"--page.port={port}", "--operator_page", "--offline_updates=20",
-        "--updates_per_episode=2", "--batch_size=4", "--demo_batch_size=4", "--steps=100000", "--arm.episode_s=1", "--arm.stale_s=5",
+        "--updates_per_episode=2", "--batch_size=4", "--demo_batch_size=4", "--steps=100000",
+        "--arm.episode_s=1", "--arm.stale_s=5",
         "--save_freq=40", "--eval.freq=60", "--eval.n_episodes=1", "--eval.final_n_episodes=1", "--log_freq=1",
         "--threads=1",
     ]  # fmt: skip

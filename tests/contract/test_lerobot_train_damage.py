@@ -1,4 +1,4 @@
-"""Damaged datasets given to the real `lerobot-train`: nothing is learned from rows or pictures that are not what they say."""
+"""Damaged datasets given to the real `lerobot-train`: nothing is learned from rows that are not what they say."""
 
 import os
 import shutil

@@ -42,6 +42,7 @@ __all__ = ["Operated", "make_operated", "recall", "steering"]
 Array = NDArray[np.float64]
 # Of a joint's range: the largest step where actions are goals, so that none says how far is usual.
 ABSOLUTE_SHARE = 0.05
+LEAST_STEP = 0.1  # of the largest step of a joint
 FAR_LIMIT = 10.0  # times the demonstrated range: degrees are 57 radians
 CURRENT_S = 0.3  # that a reading may be old, and no less than two control steps
 
@@ -214,7 +215,10 @@ def limits_of(robot: Robot, agent: Agent, settings: ArmSettings, fps: int, seen_
         margin = settings.joint_margin * span
         low[i], high[i] = given or (low[i] - margin, high[i] + margin)
     step *= min(1.0, seen_fps / fps)
-    step = np.maximum(step, 1e-3 * np.maximum(high - low, 1e-6))  # a joint that never moved
+    # A joint that hardly moved must still be able to lift itself against gravity, which shorter steps never do.
+    arm = np.array(["gripper" not in name for name in names])
+    step[arm] = np.maximum(step[arm], LEAST_STEP * step[arm].max(initial=0.0))
+    step = np.maximum(step, 1e-3 * np.maximum(high - low, 1e-6))
     box = None
     if settings.workspace is not None:
         corners = np.array(settings.workspace, dtype=np.float64).reshape(3, 2)

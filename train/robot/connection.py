@@ -49,6 +49,10 @@ def _disconnect(robot: Robot) -> None:
     if _connected(bus):
         with contextlib.suppress(Exception):
             bus.disconnect(disable_torque=False)  # type: ignore[union-attr]  # it is connected
+    # A transaction that the lost port broke off leaves the SDK's mark that it is still under way: for ever busy.
+    port: Any = getattr(bus, "port_handler", None)
+    if hasattr(port, "is_using"):
+        port.is_using = False
     for camera in _cameras(robot):
         with contextlib.suppress(Exception):
             camera.disconnect()

@@ -1,0 +1,179 @@
+"""A Feetech STS3215 servo: its control table as its manual describes it, and a shaft that moves in time.
+
+Positions are steps of 4096 a turn. Addresses, units and encodings are those of the manual (STS series), as LeRobot's
+table of the same motor has them.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+__all__ = ["BAUD_RATES", "Servo", "signed"]
+
+TURN = 4096  # steps
+BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 57_600, 38_400, 19_200)  # by the value of register 6
+SIZE = 87  # of the table, in bytes
+EEPROM_END = 40
+MODEL = 777
+FASTEST = 3400.0  # steps/s, without load at 7.4 V
+HAND_SPEED = 2500.0  # steps/s, of a person who moves a joint
+MULTI_TURN = 0x10  # of the register Phase: angles count over several turns
+
+# Register: first byte, bytes.
+ID, BAUD_RATE, MIN_POSITION, MAX_POSITION, PHASE, P_GAIN, OFFSET = (
+    (5, 1),
+    (6, 1),
+    (9, 2),
+    (11, 2),
+    (18, 1),
+    (21, 1),
+    (31, 2),
+)
+TORQUE, ACCELERATION, GOAL, GOAL_VELOCITY, LOCK = (40, 1), (41, 1), (42, 2), (46, 2), (55, 1)
+POSITION, VELOCITY, LOAD, VOLTAGE, TEMPERATURE = (56, 2), (58, 2), (60, 2), (62, 1), (63, 1)
+STATUS, MOVING, CURRENT = (65, 1), (66, 1), (69, 2)
+READ_ONLY = (*range(5), *range(56, 71))
+SIGN_BIT = {OFFSET: 11, GOAL: 15, GOAL_VELOCITY: 15, POSITION: 15, VELOCITY: 15, LOAD: 10}
+FACTORY = {
+    (0, 1): 3, (1, 1): 10, (3, 2): MODEL, ID: 1, (7, 1): 250, (8, 1): 1, MAX_POSITION: 4095, (13, 1): 70, (14, 1): 80,
+    (15, 1): 40, (16, 2): 1000, PHASE: 12, (19, 1): 44, (20, 1): 47, P_GAIN: 32, (22, 1): 32, (24, 2): 16, (28, 2): 500,
+    (30, 1): 1, (34, 1): 20, (35, 1): 200, (36, 1): 80, (37, 1): 10, (38, 1): 200, (39, 1): 10, (48, 2): 1000,
+    LOCK: 1, VOLTAGE: 74, TEMPERATURE: 31, (84, 1): 60, (85, 1): 0,
+}  # fmt: skip
+
+
+def signed(value: int, bit: int) -> int:
+    """The number that a register holds as sign and magnitude, the sign in `bit`."""
+    magnitude = value & ((1 << bit) - 1)
+    return -magnitude if value >> bit & 1 else magnitude
+
+
+def _coded(number: int, bit: int) -> int:
+    """Sign and magnitude of a number, which is cut to what fits."""
+    return min(abs(number), (1 << bit) - 1) | (number < 0) << bit
+
+
+@dataclass(kw_only=True)
+class Servo:
+    """One motor, as delivered: id 1, 1 MBd, not calibrated.
+
+    Attributes:
+        shaft: where the shaft is, in steps of its own encoder; counts on over several turns.
+        ends: between which steps the joint lets it turn.
+        sag: steps by which gravity pulls it off its goal at the factory's gain (32).
+        hand: steps to which a person turns it while its torque is off; None: nobody does.
+    """
+
+    shaft: float = 2048.0
+    ends: tuple[float, float] = (0.0, 4095.0)
+    sag: float = 0.0
+    hand: float | None = None
+    velocity: float = 0.0
+    _table: bytearray = field(default_factory=lambda: bytearray(SIZE))
+    _kept: bytes = b""
+
+    def __post_init__(self) -> None:
+        for register, value in FACTORY.items():
+            self._put(register, value)
+        self._kept = bytes(self._table)
+        self._put(GOAL, self._position())
+
+    @property
+    def id(self) -> int:
+        """Number by which it is addressed."""
+        return self._get(ID)
+
+    @property
+    def baud(self) -> int:
+        """Rate at which it listens and answers."""
+        return BAUD_RATES[self._get(BAUD_RATE) % len(BAUD_RATES)]
+
+    @property
+    def answers_writes(self) -> bool:
+        """Whether anything but a ping or a reading is answered."""
+        return bool(self._table[8])
+
+    @property
+    def torque(self) -> bool:
+        """Whether it holds and moves."""
+        return self._get(TORQUE) == 1
+
+    @property
+    def goal(self) -> int:
+        """Goal that was written last, within the limits; steps after the homing offset."""
+        low, high = self._get(MIN_POSITION), self._get(MAX_POSITION)
+        goal = signed(self._get(GOAL), SIGN_BIT[GOAL])
+        return min(max(goal, low), high) if low < high else goal
+
+    def read(self, address: int, count: int) -> bytes:
+        """Bytes of the table; beyond its end nothing is there."""
+        for register, value in (
+            (POSITION, self._position()), (VELOCITY, round(self.velocity)), (MOVING, int(abs(self.velocity) > 1)),
+            (LOAD, round(1000 * self._strain())), (CURRENT, round(100 * abs(self._strain()))),
+        ):  # fmt: skip
+            self._put(register, value)
+        return bytes(self._table[address : address + count])
+
+    def write(self, address: int, data: bytes) -> None:
+        """Change the table, but for what only the motor writes; what locked EEPROM gets is lost with the power."""
+        held = self.torque
+        for place, value in enumerate(data, address):
+            if place < SIZE and place not in READ_ONLY:
+                self._table[place] = value
+        if address < EEPROM_END and not self._get(LOCK):
+            self._kept = bytes(self._table[:EEPROM_END]) + self._kept[EEPROM_END:]
+        if self._get(TORQUE) == 128:  # which makes the present place the middle
+            self._put(OFFSET, round(self.shaft) % TURN - TURN // 2)
+            self._put(TORQUE, int(held))
+
+    def power_cycle(self) -> None:
+        """Off and on: what was not saved is what it was, and the torque is off."""
+        self._table[:] = self._kept
+        self._put(GOAL, self._position())
+        self.velocity = 0.0
+
+    def tick(self, seconds: float) -> None:
+        """Let time pass: towards the goal at the allowed speed and acceleration, or as the hand turns it."""
+        before = self.shaft
+        if self.torque:
+            self._drive(seconds)
+        elif self.hand is not None:
+            reach = HAND_SPEED * seconds
+            self.shaft += min(max(self.hand - self.shaft, -reach), reach)
+        self.shaft = min(max(self.shaft, self.ends[0]), self.ends[1])
+        self.velocity = (self.shaft - before) / seconds if seconds > 0 else self.velocity
+
+    def _drive(self, seconds: float) -> None:
+        fastest = min(float(abs(signed(self._get(GOAL_VELOCITY), 15)) or FASTEST), FASTEST)
+        push = 100.0 * (self._get(ACCELERATION) or 254)  # steps/s^2
+        rest = self._rest() - self.shaft
+        # As fast as it can still brake from, and no faster than it can become in this time.
+        wanted = math.copysign(min(fastest, math.sqrt(2 * push * abs(rest))), rest)
+        speed = self.velocity + min(max(wanted - self.velocity, -push * seconds), push * seconds)
+        step = speed * seconds
+        self.shaft += rest if abs(step) >= abs(rest) and step * rest > 0 else step
+
+    def _rest(self) -> float:
+        """Where it would come to rest, in steps of the shaft."""
+        there = self.goal + signed(self._get(OFFSET), SIGN_BIT[OFFSET])
+        if not self._get(PHASE) & MULTI_TURN:  # the turn that is nearest to the shaft's
+            there += TURN * round((self.shaft - there) / TURN) if not self.ends[0] <= there <= self.ends[1] else 0
+        return there - self.sag * 32 / max(self._get(P_GAIN), 1)
+
+    def _strain(self) -> float:
+        """Share of its torque, -1 to 1: what gravity and being kept from its goal take."""
+        if not self.torque:
+            return 0.0
+        return min(max((self._rest() - self.shaft) / 200 + self.sag / 100, -1.0), 1.0)
+
+    def _position(self) -> int:
+        there = round(self.shaft) - signed(self._get(OFFSET), SIGN_BIT[OFFSET])
+        return there if self._get(PHASE) & MULTI_TURN else there % TURN
+
+    def _get(self, register: tuple[int, int]) -> int:
+        first, count = register
+        return int.from_bytes(self._table[first : first + count], "little")
+
+    def _put(self, register: tuple[int, int], number: int) -> None:
+        first, count = register
+        value = _coded(number, SIGN_BIT[register]) if register in SIGN_BIT else number
+        self._table[first : first + count] = (value & (256**count - 1)).to_bytes(count, "little")
