@@ -1,5 +1,6 @@
 """Limits as properties, and the guard against a robot that misbehaves: judged by what reaches the motors."""
 
+import contextlib
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -10,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cqn_train.robot.guard import LATE, Guard, GuardSettings, StoppedError
+from cqn_train.robot.guard import LATE, REST_S, Guard, GuardSettings, StoppedError
 from cqn_train.robot.limits import Limits, allowed_goal
 from cqn_train.robot.readings import RobotFault
 from lerobot_cqn.errors import ConfigError
@@ -223,6 +224,27 @@ def test_the_first_readings_may_take_long(late: int) -> None:
     guard.read()
     left = iter(range(1))
     with pytest.raises(RobotFault, match=r"took 1\.2 s"):
+        guard.read()
+
+
+def test_an_arm_that_rests_off_its_goal_can_be_taken_up_again() -> None:
+    """Held by gravity or by what is in its way, an encoder may say the same for ever: that must end no run."""
+    guard, motors, clock = guarded(GuardSettings(stale_s=1.0, current_s=0.5, watchdog_s=100.0))
+    motors.send_action = lambda action: action  # type: ignore[method-assign]
+    with pytest.raises(RobotFault, match="The joints have not changed"):
+        for _ in range(40):
+            clock.now += 0.1
+            guard.send(np.array([0.0, 9.0, 0.0]))
+            guard.read()
+    clock.now += 1.0
+    with pytest.raises(RobotFault, match="The joints have not changed"):  # it was asked to move a moment ago
+        guard.read()
+    for _ in range(100):
+        clock.now += REST_S / 10
+        with contextlib.suppress(RobotFault):
+            guard.read()
+    for _ in range(40):
+        clock.now += 0.5
         guard.read()
 
 

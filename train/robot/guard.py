@@ -31,6 +31,7 @@ __all__ = ["Guard", "GuardSettings", "HeldError", "StoppedError"]
 Array = NDArray[np.float64]
 WRONG = 3  # readings in a row that cannot be true: a fault; fewer are read again
 AGAIN_S = 0.005  # between them: the same answer of a bus is not read twice
+REST_S = 5.0  # after the last goal
 LATE = 5  # readings that take too long, where nothing moves yet: cameras warm up
 ASKED = 12  # readings until enough agree, where nothing is known yet
 APART_S = 0.05  # between them: a glitch is shorter
@@ -200,7 +201,9 @@ class Guard:
 
     def _check_fresh(self, joints: Array, pictures: Mapping[str, NDArray[np.uint8]], now: float) -> None:
         """Refusal of what does not change at all, and so was not measured: noise alone makes real readings differ."""
-        moving = self._goal is not None and (np.abs(self._goal - joints) > 0.5 * self.limits.max_step).any()
+        # Sent nowhere for a while, an arm rests, where gravity and what is in its way let it: equal readings tell nothing.
+        sent = self._goal is not None and now - self._asked_at < REST_S
+        moving = sent and (np.abs(self._goal - joints) > 0.5 * self.limits.max_step).any()
         values: dict[str, NDArray[Any]] = {"joints": joints, **pictures}
         for name, value in values.items():
             same = name in self._before and np.array_equal(value, self._before[name])
