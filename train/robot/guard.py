@@ -202,8 +202,8 @@ class Guard:
     def _check_fresh(self, joints: Array, pictures: Mapping[str, NDArray[np.uint8]], now: float) -> None:
         """Refusal of what does not change at all, and so was not measured: noise alone makes real readings differ."""
         # Sent nowhere for a while, an arm rests where gravity and obstacles let it: equal readings tell nothing.
-        sent = self._goal is not None and now - self._asked_at < REST_S
-        moving = sent and (np.abs(self._goal - joints) > 0.5 * self.limits.max_step).any()
+        goal = self._goal if now - self._asked_at < REST_S else None
+        moving = goal is not None and (np.abs(goal - joints) > 0.5 * self.limits.max_step).any()
         values: dict[str, NDArray[Any]] = {"joints": joints, **pictures}
         for name, value in values.items():
             same = name in self._before and np.array_equal(value, self._before[name])
