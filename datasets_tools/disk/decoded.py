@@ -16,7 +16,7 @@ from ..views.episode import Camera
 
 __all__ = ["Coded", "Colours", "Decoded", "Handed"]
 
-# Formats of 8 bits whose planes can be scaled one by one, and the one of each without halved colour planes.
+# Formats of 8 bits that can be cut plane by plane, and the one of each without halved colour planes.
 PLANAR = {
     "yuv420p": "yuv444p", "yuv422p": "yuv444p", "yuv444p": "yuv444p",
     "yuvj420p": "yuvj444p", "yuvj422p": "yuvj444p", "yuvj444p": "yuvj444p",

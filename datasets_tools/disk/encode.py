@@ -118,7 +118,9 @@ def _encode(
     _refuse_unknown_kinds(source)
     features = {k: {n: v for n, v in f.items() if n != "info"} for k, f in all_features(view).items()}
     encoder = _encoder(source, crf)
-    unchanged = {k for k in view.cameras if view.cameras[k] == Camera() and _settings_of(source, k) == encoder}
+    unchanged = {
+        k for k in view.cameras if view.cameras[k] == Camera() and encoder and _settings_of(source, k) == encoder
+    }
     alike = {k for k in unchanged if _says_all(source, k)}
     _note_losses(source)
     line = bar.add_task("Writing frames", total=sum(lengths.values()))

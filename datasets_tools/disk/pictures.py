@@ -16,7 +16,7 @@ from .decoded import Coded, Colours, Decoded
 
 __all__ = ["picture_size", "shaped", "video_pictures"]
 
-AV1 = ("libdav1d", "av1", "libaom-av1")  # FFmpeg's names of its decoders
+AV1_DECODERS = ("libdav1d", "av1", "libaom-av1")  # FFmpeg's names
 SEQUENCE_HEADER, TEMPORAL_DELIMITER = 1, 2  # AV1 bitstream specification, 6.2.2
 
 type Picture = NDArray[np.uint8]
@@ -79,7 +79,7 @@ def video_pictures(
 
 def _with_bytes(container: Any, stream: Any) -> Iterator[tuple[Any, Coded | None]]:
     """Decoded pictures with their bytes in the file, which are kept of AV1: there one packet is one picture."""
-    if stream.codec_context.name not in AV1:
+    if stream.codec_context.name not in AV1_DECODERS:
         yield from ((frame, None) for frame in container.decode(stream))
         return
     coded: dict[int | None, Coded | None] = {}

@@ -18,8 +18,7 @@ from .decoded import Coded, Decoded, Handed
 
 __all__ = ["VideoEncoder"]
 
-
-AV1 = "libsvtav1"
+AV1_ENCODER = "libsvtav1"  # FFmpeg's name
 
 
 class VideoEncoder(StreamingVideoEncoder):
@@ -99,7 +98,7 @@ class _Film(threading.Thread):
 
     def _coded(self, picture: Decoded | NDArray[Any]) -> Coded | None:
         """Bytes of a picture that can stand in this film as they are."""
-        if not isinstance(picture, Decoded) or self._settings.vcodec != AV1:
+        if not isinstance(picture, Decoded) or self._settings.vcodec != AV1_ENCODER:
             return None
         return picture.coded if picture.frame.format.name == self._settings.pix_fmt else None
 

@@ -164,6 +164,18 @@ def test_slow_motion_of_a_film_whose_quality_nobody_wrote_down_stays(tmp_path):
     assert (changes(seen(tmp_path / "dst")) < FROZEN * changes(seen(root)[kept])).sum() == 0
 
 
+def test_a_film_in_a_codec_that_cannot_be_encoded_here_becomes_key_frames(tmp_path):
+    """What is said of it is true, and of another codec: nothing of it is encoded as it was."""
+    root = record(tmp_path / "src", film(), "h264", crf=5, g=30)
+    path = root / "meta/info.json"
+    info = json.loads(path.read_text())
+    info["features"][TOP]["info"]["video.codec"] = "vp9"
+    path.write_text(json.dumps(info))
+    run("trim", root, tmp_path / "dst", "--head=1")
+    with av.open(str(next((tmp_path / "dst/videos").rglob("*.mp4")))) as container:
+        assert all(frame.key_frame for frame in container.decode(video=0))
+
+
 @pytest.mark.parametrize("codec", CODECS)
 def test_ten_generations_leave_colours_and_motion(tmp_path, codec):
     record(tmp_path / "0", film(steps=22), codec)
