@@ -62,16 +62,20 @@ def run(valid: ValidRun) -> int:
 
     with ConsoleMonitor() as monitor, StopRequest() as should_stop, contextlib.ExitStack() as stack:
         trainer = build(valid, monitor, should_stop, stack)
+        again = f"Continue with: cqn-train --resume=true --output_dir={valid.output_dir}"
         try:
             trainer.run()
         except Interrupted:
             trainer.save()
-            monitor.message(f"Stopped. Continue with: cqn-train --resume=true --output_dir={valid.output_dir}")
+            monitor.message(f"Stopped. {again}")
             return 130
         except OSError:  # of the machine (no descriptors left, a device gone): what was learned is sound
-            with contextlib.suppress(OSError):
-                trainer.save()
-                monitor.message(f"Saved. Continue with: cqn-train --resume=true --output_dir={valid.output_dir}")
+            if (
+                trainer.counters.updates or trainer.counters.episodes
+            ):  # else nothing is learned, and the same command begins again
+                with contextlib.suppress(OSError):
+                    trainer.save()
+                    monitor.message(f"Saved. {again}")
             raise
         monitor.message(f"Policy: {valid.output_dir}/checkpoints/last/pretrained_model")
         from .run.judgement import practice, read_tables

@@ -4,6 +4,7 @@ import fcntl
 import logging
 import os
 import shutil
+import socket
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -134,6 +135,28 @@ def recorded_arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
         record_demonstrations(folder, *ARM_CAMERA, "--robot.state=true", episodes=3)
 
     return once(tmp_path_factory, "recorded_arm", record) / "demos"
+
+
+@pytest.fixture(scope="session")
+def cleaned_arm(recorded_arm: Path, command: Command, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of `recorded_arm` after the paper's recipe, as local/cqn: joint differences, pictures of 84x84."""
+
+    def clean(folder: Path) -> None:
+        command(
+            "cqn-data", "run", "paper_real_world", "--repo_id=local/demos", f"--root={recorded_arm}",
+            "--new_repo_id=local/cqn", f"--new_root={folder / 'cqn'}",
+        )  # fmt: skip
+
+    return once(tmp_path_factory, "cleaned_arm", clean) / "cqn"
+
+
+@pytest.fixture
+def free_port() -> Iterator[int]:
+    """A free port that nobody else is given meanwhile: it is bound here, and a server may listen on it all the same."""
+    with socket.socket() as ours:
+        ours.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        ours.bind(("127.0.0.1", 0))
+        yield ours.getsockname()[1]
 
 
 @pytest.fixture(autouse=True)

@@ -4,7 +4,6 @@ import contextlib
 import csv
 import json
 import socket
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,17 +23,6 @@ SMALL_EYES = ["--policy.encoder_channels=[4,8]", "--policy.shift_pixels=2"]
 JOINTS = slice(0, 6)
 
 
-@pytest.fixture(scope="module")
-def demonstrations(recorded_arm: Path, command: Command, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of demonstrations after the paper's recipe: joint differences, pictures of 84x84."""
-    folder = tmp_path_factory.mktemp("rollout")
-    command(
-        "cqn-data", "run", "paper_real_world", "--repo_id=local/demos", f"--root={recorded_arm}",
-        "--new_repo_id=local/cqn", f"--new_root={folder / 'cqn'}",
-    )  # fmt: skip
-    return folder / "cqn"
-
-
 @pytest.mark.real_time(reason="lerobot-rollout drives the simulated arm for three seconds of the machine's own clock")
 @pytest.mark.parametrize(
     ("trained", "robot"),
@@ -42,13 +30,13 @@ def demonstrations(recorded_arm: Path, command: Command, tmp_path_factory: pytes
     ids=["state", "sequences", "camera"],
 )
 def test_rollout_sends_absolute_goals(
-    trained: list[str], robot: list[str], demonstrations: Path, command: Command, tmp_path: Path
+    trained: list[str], robot: list[str], cleaned_arm: Path, command: Command, tmp_path: Path
 ) -> None:
     kind = [option for option in trained if option.startswith("--policy.type=")]
     command(
         "lerobot-train", *TINY_POLICY[len(kind) :], *trained, "--policy.push_to_hub=false",
         "--dataset.repo_id=local/cqn",
-        f"--dataset.root={demonstrations}", "--batch_size=4", "--num_workers=0", "--steps=24", "--wandb.enable=false",
+        f"--dataset.root={cleaned_arm}", "--batch_size=4", "--num_workers=0", "--steps=24", "--wandb.enable=false",
         f"--output_dir={tmp_path / 'run'}",
     )  # fmt: skip
     command(
@@ -62,7 +50,7 @@ def test_rollout_sends_absolute_goals(
     rows = pd.concat([pd.read_parquet(file) for file in sorted((tmp_path / "seen").glob("data/**/*.parquet"))])
     measured, goals = (np.stack(rows[name].to_numpy()).astype(float) for name in ("observation.state", "action"))
     assert len(goals) >= 10  # of 45, however busy the machine is
-    stats = json.loads((demonstrations / "meta/stats.json").read_text())["action"]
+    stats = json.loads((cleaned_arm / "meta/stats.json").read_text())["action"]
     low, high = (np.array(stats[name]) for name in ("min", "max"))
     away = goals[:, JOINTS] - measured[:, JOINTS]
     assert (away >= low[JOINTS] - 0.01).all()  # degrees
@@ -75,15 +63,6 @@ def test_rollout_sends_absolute_goals(
     assert np.ptp(measured[:, JOINTS], axis=0).max() > 0.5  # it moved
 
 
-@pytest.fixture
-def port() -> Iterator[int]:
-    """A free port that nobody else is given meanwhile: it is bound here, and a server may listen on it all the same."""
-    with socket.socket() as ours:
-        ours.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        ours.bind(("127.0.0.1", 0))
-        yield ours.getsockname()[1]
-
-
 def rows(run: Path, table: str) -> list[dict[str, str]]:
     path = run / f"{table}.csv"
     return list(csv.DictReader(path.open())) if path.exists() else []
@@ -91,7 +70,7 @@ def rows(run: Path, table: str) -> list[dict[str, str]]:
 
 @pytest.mark.real_time(reason="the arm and the person of another process live by the machine's own clock")
 def test_online_with_a_person_killed_and_resumed(
-    demonstrations: Path, command: Command, processes: Zygote, port: int, tmp_path: Path,
+    cleaned_arm: Path, command: Command, processes: Zygote, free_port: int, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """A simulated person at the page starts, takes over and labels; a kill loses no finished episode."""
@@ -99,8 +78,8 @@ def test_online_with_a_person_killed_and_resumed(
     run, log = tmp_path / "run", tmp_path / "log.txt"
     arguments = [
         *TINY_POLICY, *SMALL_EYES, *ARM_CAMERA, "--robot.type=sim_ur5e", "--robot.state=true", "--robot.speed=4",
-        f"--robot.person=http://127.0.0.1:{port}", "--robot.person_takes_over_s=2", "--teleop.type=sim_leader",
-        "--dataset.repo_id=local/cqn", f"--dataset.root={demonstrations}", f"--page.port={port}", "--operator_page",
+        f"--robot.person=http://127.0.0.1:{free_port}", "--robot.person_takes_over_s=2", "--teleop.type=sim_leader",
+        "--dataset.repo_id=local/cqn", f"--dataset.root={cleaned_arm}", f"--page.port={free_port}", "--operator_page",
         "--offline_updates=2", "--updates_per_episode=2", "--batch_size=4", "--demo_batch_size=4", "--steps=100000",
         "--arm.episode_s=2.5", "--save_freq=40", "--log_freq=1", "--threads=1", f"--output_dir={run}",
     ]  # fmt: skip
@@ -117,10 +96,10 @@ def test_online_with_a_person_killed_and_resumed(
         "cqn-train", "--resume=true", f"--output_dir={run}", f"--steps={int(before[-1]['env_steps']) + 30}",
         "--eval.final_n_episodes=1",
     )  # fmt: skip
-    assert f"Operator's page: http://127.0.0.1:{port}/ (with its token in {run}/page/address" in done.stdout
+    assert f"Operator's page: http://127.0.0.1:{free_port}/ (with its token in {run}/page/address" in done.stdout
     address = run / "page" / "address"  # which may be read by nobody else, unlike a log
     assert address.stat().st_mode & 0o777 == 0o600
-    assert address.read_text() == f"http://127.0.0.1:{port}/?token=a-token-of-the-test\n"
+    assert address.read_text() == f"http://127.0.0.1:{free_port}/?token=a-token-of-the-test\n"
     assert "Hz of 40" in done.stdout
     after = rows(run, "episodes")
     assert [int(row["episode"]) for row in after] == list(range(len(after)))
@@ -143,9 +122,9 @@ def test_online_with_a_person_killed_and_resumed(
     (["--robot.type=sim_ur5e", *ARM_CAMERA, "--robot.state=true", "--operator_page=false"], "There is no terminal"),
 ])  # fmt: skip
 def test_mistakes_are_said_before_anything_moves(
-    options: list[str], said: str, demonstrations: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str], said: str, cleaned_arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    data = ["--dataset.repo_id=local/cqn", f"--dataset.root={demonstrations}"]
+    data = ["--dataset.repo_id=local/cqn", f"--dataset.root={cleaned_arm}"]
     assert main([*TINY_POLICY, *SMALL_EYES, *data, *options, f"--output_dir={tmp_path / 'run'}"]) == 2
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert said in error
@@ -153,14 +132,14 @@ def test_mistakes_are_said_before_anything_moves(
 
 
 def test_a_port_in_use_is_said_before_anything_is_written(
-    demonstrations: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    cleaned_arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
         options = [
-            *TINY_POLICY, *SMALL_EYES, *ARM_CAMERA, "--dataset.repo_id=local/cqn", f"--dataset.root={demonstrations}",
+            *TINY_POLICY, *SMALL_EYES, *ARM_CAMERA, "--dataset.repo_id=local/cqn", f"--dataset.root={cleaned_arm}",
             "--robot.type=sim_ur5e", "--robot.state=true", f"--page.port={port}",
             f"--output_dir={tmp_path / 'run'}",
         ]  # fmt: skip

@@ -1,13 +1,11 @@
 """`kill -9` at any moment of a session at the arm: no finished episode is lost, and the same command goes on."""
 
 import random
-import socket
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from .conftest import ARM_CAMERA, TINY_POLICY, Command
+from .conftest import ARM_CAMERA, TINY_POLICY
 from .test_cqn_train_kills import kill_in_phases
 from .zygote import Zygote
 
@@ -16,29 +14,14 @@ pytest.importorskip("fastapi", reason="needs the extra [page]")
 
 
 @pytest.fixture
-def port() -> Iterator[int]:
-    """A free port that nobody else is given meanwhile: it is bound here, and a server may listen on it all the same."""
-    with socket.socket() as ours:
-        ours.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        ours.bind(("127.0.0.1", 0))
-        yield ours.getsockname()[1]
-
-
-@pytest.fixture
-def session(
-    recorded_arm: Path, command: Command, tmp_path: Path, port: int, monkeypatch: pytest.MonkeyPatch
-) -> list[str]:
+def session(cleaned_arm: Path, free_port: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Options of a session on the simulated arm, with a simulated person who answers at the page."""
     monkeypatch.setenv("CQN_PAGE_TOKEN", "a-token-of-the-test")
-    command(
-        "cqn-data", "run", "paper_real_world", "--repo_id=local/demos", f"--root={recorded_arm}",
-        "--new_repo_id=local/cqn", f"--new_root={tmp_path / 'cqn'}",
-    )  # fmt: skip
     return [
         *TINY_POLICY, *ARM_CAMERA, "--policy.encoder_channels=[4,8]", "--policy.shift_pixels=2",
         "--robot.type=sim_ur5e", "--robot.state=true", "--robot.speed=8",
-        f"--robot.person=http://127.0.0.1:{port}", "--teleop.type=sim_leader", "--dataset.repo_id=local/cqn",
-        f"--dataset.root={tmp_path / 'cqn'}", f"--page.port={port}", "--operator_page", "--offline_updates=20",
+        f"--robot.person=http://127.0.0.1:{free_port}", "--teleop.type=sim_leader", "--dataset.repo_id=local/cqn",
+        f"--dataset.root={cleaned_arm}", f"--page.port={free_port}", "--operator_page", "--offline_updates=20",
         "--updates_per_episode=2", "--batch_size=4", "--demo_batch_size=4", "--steps=100000",
         "--arm.episode_s=1", "--arm.stale_s=5",
         "--save_freq=40", "--eval.freq=60", "--eval.n_episodes=1", "--eval.final_n_episodes=1", "--log_freq=1",

@@ -177,12 +177,14 @@ def test_the_same_command_works_again_after_a_beginning_that_failed(
         f"--output_dir={run}",
     ]
 
-    def fail(_: Any) -> None:
-        raise ConfigError("The robot cannot be connected.")
+    for error in (ConfigError("The robot cannot be connected."), OSError("The camera is gone.")):
 
-    with monkeypatch.context() as broken:
-        broken.setattr(GymEnvironment, "open", fail, raising=False)
-        assert main(options) == 2
+        def fail(_: Any, error: Exception = error) -> None:
+            raise error
+
+        with monkeypatch.context() as broken:
+            broken.setattr(GymEnvironment, "open", fail, raising=False)
+            assert main(options) == 2
     assert main(options) == 0
     assert main(options) == 2  # now it holds a run
     assert "exists and is not empty" in capsys.readouterr().err

@@ -5,7 +5,6 @@ import functools
 import io
 import itertools
 import os
-import socket
 import subprocess
 import sys
 import threading
@@ -260,7 +259,7 @@ class Spoken:
 
 
 @pytest.mark.slow
-def test_the_documented_commands_from_setup_to_rollout(tmp_path: Path) -> None:  # noqa: PLR0915  # one long way
+def test_the_documented_commands_from_setup_to_rollout(tmp_path: Path, free_port: int) -> None:  # noqa: PLR0915  # one long way
     """lerobot-setup-motors, -calibrate, -teleoperate, -record, cqn-data, cqn-train, lerobot-rollout on two arms."""
     home = {"HF_LEROBOT_HOME": str(tmp_path / "home"), "HF_LEROBOT_CALIBRATION": str(tmp_path / "calibration")}
     names = {"follower": str(tmp_path / "ttyF"), "leader": str(tmp_path / "ttyL")}
@@ -317,16 +316,13 @@ def test_the_documented_commands_from_setup_to_rollout(tmp_path: Path) -> None: 
         "--new_repo_id=local/clean", f"--new_root={tmp_path / 'clean'}", **home,
     )  # fmt: skip
     clean.ends()
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        page = free.getsockname()[1]
     train = Spoken(
         "cqn-train", *both, "--dataset.repo_id=local/clean", f"--dataset.root={tmp_path / 'clean'}", *TINY_POLICY,
         "--offline_updates=20", "--updates_per_episode=2", "--batch_size=4", "--demo_batch_size=4", "--steps=60",
         "--arm.episode_s=2", "--eval.final_n_episodes=1", "--eval.freq=0", "--threads=1", "--operator_page",
-        f"--page.port={page}", f"--output_dir={tmp_path / 'run'}", **home, CQN_PAGE_TOKEN=TOKEN,
+        f"--page.port={free_port}", f"--output_dir={tmp_path / 'run'}", **home, CQN_PAGE_TOKEN=TOKEN,
     )  # fmt: skip
-    person(page, train)
+    person(free_port, train)
     train.ends()
     assert "Limits changed goals" in train.said
     episodes = pd.read_csv(tmp_path / "run/episodes.csv")

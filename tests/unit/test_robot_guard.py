@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cqn_train.robot.guard import LATE, REST_S, Guard, GuardSettings, StoppedError
+from cqn_train.robot.guard import LATE, TELLS_S, Guard, GuardSettings, StoppedError
 from cqn_train.robot.limits import Limits, allowed_goal
 from cqn_train.robot.readings import RobotFault
 from lerobot_cqn.errors import ConfigError
@@ -240,7 +240,7 @@ def test_an_arm_that_rests_off_its_goal_can_be_taken_up_again() -> None:
     with pytest.raises(RobotFault, match="The joints have not changed"):  # it was asked to move a moment ago
         guard.read()
     for _ in range(100):
-        clock.now += REST_S / 10
+        clock.now += TELLS_S / 10
         with contextlib.suppress(RobotFault):
             guard.read()
     for _ in range(40):

@@ -33,9 +33,7 @@ def word(number: int) -> bytes:
 
 def numbered(number: int, **options: float) -> Servo:
     servo = Servo(**options)  # type: ignore[arg-type]
-    servo.write(55, b"\0")
-    servo.write(5, bytes([number]))
-    servo.write(55, b"\1")
+    servo.renumber(number)
     return servo
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_cqn.errors import OutputError
 from lerobot_cqn.learner import Learner, NonFiniteLossError
 from lerobot_cqn.schema import Batch
 
@@ -127,18 +126,10 @@ class Trainer:
         c, freq = self.counters, self.config.eval_freq
         if freq and c.env_steps // freq > before // freq and c.env_steps < self.config.steps:
             self.evaluate("online", self.config.eval.n_episodes)
-        self.check_room()
+        check_room(self.metrics.output_dir)  # while a last checkpoint still fits
         if c.env_steps // self.config.save_freq > before // self.config.save_freq:
             self.person.learning("saving a checkpoint")
             self.save()
-
-    def check_room(self) -> None:
-        """Save and end where the disk is nearly full: there is still room for this. Raises OutputError."""
-        try:
-            check_room(self.metrics.output_dir)
-        except OutputError:
-            self.save()
-            raise
 
     def episode(self) -> None:
         """Act once from reset to end, learn while acting, and store what happened."""

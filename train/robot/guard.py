@@ -31,7 +31,7 @@ __all__ = ["Guard", "GuardSettings", "HeldError", "StoppedError"]
 Array = NDArray[np.float64]
 WRONG = 3  # readings in a row that cannot be true: a fault; fewer are read again
 AGAIN_S = 0.005  # between them: the same answer of a bus is not read twice
-REST_S = 5.0  # after the last goal
+TELLS_S = 5.0  # after the last goal: then joints that do not change are no sign any more
 LATE = 5  # readings that take too long, where nothing moves yet: cameras warm up
 ASKED = 12  # readings until enough agree, where nothing is known yet
 APART_S = 0.05  # between them: a glitch is shorter
@@ -202,7 +202,7 @@ class Guard:
     def _check_fresh(self, joints: Array, pictures: Mapping[str, NDArray[np.uint8]], now: float) -> None:
         """Refusal of what does not change at all, and so was not measured: noise alone makes real readings differ."""
         # Sent nowhere for a while, an arm rests where gravity and obstacles let it: equal readings tell nothing.
-        goal = self._goal if now - self._asked_at < REST_S else None
+        goal = self._goal if now - self._asked_at < TELLS_S else None
         moving = goal is not None and (np.abs(goal - joints) > 0.5 * self.limits.max_step).any()
         values: dict[str, NDArray[Any]] = {"joints": joints, **pictures}
         for name, value in values.items():

@@ -30,9 +30,7 @@ def assembled(seed: int, *, numbered: bool = True) -> Chain:
         low = float(rng.integers(0, TURN - span)) if span < TURN - 1 else 0.0
         servo = Servo(shaft=low + span / 2, ends=(low, low + span), sag=SAGS.get(joint, 0.0))
         if numbered:
-            servo.write(55, b"\0")
-            servo.write(5, bytes([number]))
-            servo.write(55, b"\1")
+            servo.renumber(number)
         servos.append(servo)
     return Chain(servos)
 

@@ -56,7 +56,7 @@ class Chain:
 
     Attributes:
         servos: in the order of the wire.
-        plugged: how many of them, from the first on, are connected; or those that are, by their place.
+        plugged: places of those that are connected.
         faults: of the answers, present ones.
     """
 
@@ -132,7 +132,7 @@ class Chain:
             servo.write(*self._waiting.pop(place))
 
     def _answer(self, servo: Servo, address: int, count: int) -> list[tuple[float, bytes]]:
-        data, status = servo.read(address, count), 0
+        data = servo.read(address, count)
         kinds = {fault.kind for fault in self._struck(servo)}
         status = OVERLOAD * (FaultKind.OVERLOAD in kinds) | OVERHEAT * (FaultKind.OVERHEAT in kinds)
         first, size = POSITION

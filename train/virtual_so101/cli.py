@@ -80,7 +80,7 @@ def _lines(ports: dict[str, VirtualPort], off: threading.Event) -> None:
             return
         try:
             said = _obey(ports, words) if words else ""
-        except CQNError as error:
+        except (CQNError, OSError) as error:
             said = f"error: {error}"
         if said:
             print(said, flush=True)  # noqa: T201

@@ -16,7 +16,7 @@ from .chain import Chain
 __all__ = ["VirtualPort"]
 
 LOOK_S = 0.002  # between two looks at the wire, in which the motors move
-RATES = {
+RATES = {  # that a terminal has names for: at others nobody answers
     termios.B1000000: 1_000_000, termios.B500000: 500_000, termios.B115200: 115_200, termios.B57600: 57_600,
     termios.B38400: 38_400, termios.B19200: 19_200,
 }  # fmt: skip
@@ -49,7 +49,9 @@ class VirtualPort:
         self.unplug()
 
     def plug(self) -> None:
-        """Make the port; the motors are switched on and move from now on."""
+        """Make the port, where there is none; the motors move from now on."""
+        if self._ends is not None:
+            return
         near, far = os.openpty()
         tty.setraw(far)
         os.set_blocking(near, False)

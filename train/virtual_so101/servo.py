@@ -19,25 +19,18 @@ HAND_SPEED = 2500.0  # steps/s, of a person who moves a joint
 MULTI_TURN = 0x10  # of the register Phase: angles count over several turns
 
 # Register: first byte, bytes.
-ID, BAUD_RATE, MIN_POSITION, MAX_POSITION, PHASE, P_GAIN, OFFSET = (
-    (5, 1),
-    (6, 1),
-    (9, 2),
-    (11, 2),
-    (18, 1),
-    (21, 1),
-    (31, 2),
-)
+ID, BAUD_RATE, STATUS_LEVEL, MIN_POSITION, MAX_POSITION = (5, 1), (6, 1), (8, 1), (9, 2), (11, 2)
+PHASE, P_GAIN, OFFSET = (18, 1), (21, 1), (31, 2)
 TORQUE, ACCELERATION, GOAL, GOAL_VELOCITY, LOCK = (40, 1), (41, 1), (42, 2), (46, 2), (55, 1)
 POSITION, VELOCITY, LOAD, VOLTAGE, TEMPERATURE = (56, 2), (58, 2), (60, 2), (62, 1), (63, 1)
 STATUS, MOVING, CURRENT = (65, 1), (66, 1), (69, 2)
 READ_ONLY = (*range(5), *range(56, 71))
 SIGN_BIT = {OFFSET: 11, GOAL: 15, GOAL_VELOCITY: 15, POSITION: 15, VELOCITY: 15, LOAD: 10}
 FACTORY = {
-    (0, 1): 3, (1, 1): 10, (3, 2): MODEL, ID: 1, (7, 1): 250, (8, 1): 1, MAX_POSITION: 4095, (13, 1): 70, (14, 1): 80,
-    (15, 1): 40, (16, 2): 1000, PHASE: 12, (19, 1): 44, (20, 1): 47, P_GAIN: 32, (22, 1): 32, (24, 2): 16, (28, 2): 500,
-    (30, 1): 1, (34, 1): 20, (35, 1): 200, (36, 1): 80, (37, 1): 10, (38, 1): 200, (39, 1): 10, (48, 2): 1000,
-    LOCK: 1, VOLTAGE: 74, TEMPERATURE: 31, (84, 1): 60, (85, 1): 0,
+    (0, 1): 3, (1, 1): 10, (3, 2): MODEL, ID: 1, (7, 1): 250, STATUS_LEVEL: 1, MAX_POSITION: 4095, (13, 1): 70,
+    (14, 1): 80, (15, 1): 40, (16, 2): 1000, PHASE: 12, (19, 1): 44, (20, 1): 47, P_GAIN: 32, (22, 1): 32, (24, 2): 16,
+    (28, 2): 500, (30, 1): 1, (34, 1): 20, (35, 1): 200, (36, 1): 80, (37, 1): 10, (38, 1): 200, (39, 1): 10,
+    (48, 2): 1000, LOCK: 1, VOLTAGE: 74, TEMPERATURE: 31, (84, 1): 60, (85, 1): 0,
 }  # fmt: skip
 
 
@@ -90,7 +83,7 @@ class Servo:
     @property
     def answers_writes(self) -> bool:
         """Whether anything but a ping or a reading is answered."""
-        return bool(self._table[8])
+        return bool(self._get(STATUS_LEVEL))
 
     @property
     def torque(self) -> bool:
@@ -101,8 +94,13 @@ class Servo:
     def goal(self) -> int:
         """Goal that was written last, within the limits; steps after the homing offset."""
         low, high = self._get(MIN_POSITION), self._get(MAX_POSITION)
-        goal = signed(self._get(GOAL), SIGN_BIT[GOAL])
+        goal = self._signed(GOAL)
         return min(max(goal, low), high) if low < high else goal
+
+    def renumber(self, number: int) -> None:
+        """Give it an id for good, as `lerobot-setup-motors` does."""
+        for (address, _), value in ((LOCK, 0), (ID, number), (LOCK, 1)):
+            self.write(address, bytes([value]))
 
     def read(self, address: int, count: int) -> bytes:
         """Bytes of the table; beyond its end nothing is there."""
@@ -143,7 +141,7 @@ class Servo:
         self.velocity = (self.shaft - before) / seconds if seconds > 0 else self.velocity
 
     def _drive(self, seconds: float) -> None:
-        fastest = min(float(abs(signed(self._get(GOAL_VELOCITY), 15)) or FASTEST), FASTEST)
+        fastest = min(float(abs(self._signed(GOAL_VELOCITY)) or FASTEST), FASTEST)
         push = 100.0 * (self._get(ACCELERATION) or 254)  # steps/s^2
         rest = self._rest() - self.shaft
         # As fast as it can still brake from, and no faster than it can become in this time.
@@ -154,7 +152,7 @@ class Servo:
 
     def _rest(self) -> float:
         """Where it would come to rest, in steps of the shaft."""
-        there = self.goal + signed(self._get(OFFSET), SIGN_BIT[OFFSET])
+        there = self.goal + self._signed(OFFSET)
         if not self._get(PHASE) & MULTI_TURN:  # the turn that is nearest to the shaft's
             there += TURN * round((self.shaft - there) / TURN) if not self.ends[0] <= there <= self.ends[1] else 0
         return there - self.sag * 32 / max(self._get(P_GAIN), 1)
@@ -166,12 +164,15 @@ class Servo:
         return min(max((self._rest() - self.shaft) / 200 + self.sag / 100, -1.0), 1.0)
 
     def _position(self) -> int:
-        there = round(self.shaft) - signed(self._get(OFFSET), SIGN_BIT[OFFSET])
+        there = round(self.shaft) - self._signed(OFFSET)
         return there if self._get(PHASE) & MULTI_TURN else there % TURN
 
     def _get(self, register: tuple[int, int]) -> int:
         first, count = register
         return int.from_bytes(self._table[first : first + count], "little")
+
+    def _signed(self, register: tuple[int, int]) -> int:
+        return signed(self._get(register), SIGN_BIT[register])
 
     def _put(self, register: tuple[int, int], number: int) -> None:
         first, count = register
