@@ -10,16 +10,19 @@ export HF_HUB_OFFLINE ?= 1
 test slow: export OMP_NUM_THREADS = 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-arm test slow check docs format setup pins release-check compatibility clean distclean
+.PHONY: help demo demo-arm demo-so101 test slow check docs format setup pins release-check compatibility clean distclean
 
 help: ## show the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: ## see it work: a small training run with its report, in outputs/demo
 	@$(RUN) .venv/bin/python -m cqn_train.demo.station --output_dir=outputs/demo $(ARGS)
 
 demo-arm: ## the same on a simulated arm: lerobot-record, the operator's page, a simulated person; in outputs/demo-arm
 	@$(RUN) .venv/bin/python -m cqn_train.demo.arm --output_dir=outputs/demo-arm $(ARGS)
+
+demo-so101: ## two virtual SO-101 from setting up their motors to a better policy, by LeRobot's commands; in outputs/demo-so101
+	@$(RUN) .venv/bin/python -m cqn_train.demo.so101 --output_dir=outputs/demo-so101 $(ARGS)
 
 test: ## the fast tests
 	@$(RUN) .venv/bin/python -m pytest -n $(WORKERS) $(SPREAD) --durations=10 $(ARGS)

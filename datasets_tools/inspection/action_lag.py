@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lerobot_cqn.errors import DataError
 
 from ..decisions.joints import Matched, match_joints
+from ..decisions.leaps import Leaps
 from ..disk.source import Source
 
 __all__ = ["Correlation", "Follow", "FollowKind"]
@@ -60,12 +61,13 @@ class Follow:
     Attributes:
         action_dims, state_dims: (J,) matching dimensions of action and state, grippers left out.
         fps: steps a second.
+        leaps: of the commands, should they be positions.
         remark: what was taken for granted in matching; "" where nothing was.
     """
 
     def __init__(self, matched: Matched, fps: float) -> None:
         self.action_dims, self.state_dims, self.fps = matched.action_dims, matched.state_dims, fps
-        self.remark = matched.remark()
+        self.remark, self.leaps = matched.remark(), Leaps()
         joints = len(self.action_dims)
         self._lags = range(min(MAX_LAG, round(MAX_LAG_S * fps)) + 1)
         self._level = Correlation(joints)
@@ -82,11 +84,12 @@ class Follow:
             return None
         return cls(matched, source.fps) if matched.action_dims else None
 
-    def add(self, action: Array, state: Array) -> None:
-        """Take in one episode: (T, A) and (T, S)."""
+    def add(self, number: int, action: Array, state: Array) -> None:
+        """Take in one episode: its number, (T, A) and (T, S)."""
         a, s = action[:, list(self.action_dims)], state[:, list(self.state_dims)]
         if len(a) < 3:
             return
+        self.leaps.add(number, a, s)
         self._gap += np.abs(a - s).sum(axis=0)
         self._pace += np.abs(np.diff(s, axis=0)).sum(axis=0)
         self._count += len(a)

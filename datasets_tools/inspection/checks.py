@@ -327,6 +327,15 @@ def _following(dataset: Dataset, numbers: Numbers) -> Iterator[Finding]:
         )
         advice = "Noise, a limit that cuts them off, or another unit; differences of such commands are as large."
         yield Finding("warning", "far_commands", ACTION, text, advice)
+    if kind == "absolute" and (leaps := follow.leaps.found()):
+        first, (steps, joint, times) = next(iter(leaps.items()))
+        name = numbers.of(ACTION)[follow.action_dims[joint]].name
+        text = (
+            f"The arm leaps to the leader at the start of {count(list(leaps))} of {len(numbers.episodes)}: in episode"
+            f" {first} '{name}' is {times:.1f} times as far from its command as it is later at most, for {steps} of its"
+            f" steps. As differences these commands alone set the action bounds."
+        )
+        yield Finding("warning", "leaps", episodes_text(list(leaps)), text, "Cut them off: cqn-data trim --leap")
     if lag is not None and lag[0] / dataset.fps > LAG_S:
         text = f"The arm follows its command only after {lag[0]} steps ({lag[0] / dataset.fps:.2f} s)."
         yield Finding("warning", "lag", ACTION, text, "Look for a delay in the control loop or in the recording.")

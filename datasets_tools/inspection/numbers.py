@@ -196,7 +196,7 @@ def _first_look(source: Source, episode: Episode, numbers: Numbers) -> None:
             for dimension, low, high in zip(numbers.of(column), values.min(axis=0), values.max(axis=0), strict=True):
                 dimension.low, dimension.high = min(dimension.low, float(low)), max(dimension.high, float(high))
     if numbers.follow is not None:
-        numbers.follow.add(_vectors(episode, ACTION), _vectors(episode, STATE))
+        numbers.follow.add(episode.index, _vectors(episode, ACTION), _vectors(episode, STATE))
     for task in episode.tasks:
         numbers.tasks[task] = numbers.tasks.get(task, 0) + 1
     for key, values in episode.columns.items():

@@ -1,4 +1,4 @@
-"""``cqn-data trim``: cut the heads and tails of episodes, by steps, seconds, motion, or after the first success."""
+"""``cqn-data trim``: cut the heads and tails of episodes, by steps, seconds, leaps, motion, or after the success."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -25,12 +25,13 @@ class Trim(Step):
 
     name = "trim"
     example = """
+cqn-data trim --repo_id=local/click --root=data/click --new_root=data/click_trimmed --leap
 cqn-data trim --repo_id=local/click --root=data/click --new_root=data/click_trimmed --motion --auto --keep_still=5
 cqn-data trim --repo_id=local/click --root=data/click --head_seconds=0.5 --tail=3 --dry_run
 """
     notes = """
-First --after_success, then --head and --tail (or the episode's --cuts), then --motion. A part that carries a reward or
-an end is only cut off with --cut_rewards.
+First --after_success, then --leap, then --head and --tail (or the episode's --cuts), then --motion. A part that
+carries a reward or an end is only cut off with --cut_rewards.
 """
 
     head: int = option(0, help="Steps to cut at the start.")
@@ -44,6 +45,9 @@ an end is only cut off with --cut_rewards.
         },
     )
     cut_rewards: bool = option(False, help="Cut off rewards and ends, too: a label step writes them anew after it.")
+    leap: bool = option(
+        False, help="Cut the first steps in which the arm is on its way to a leader that stood elsewhere."
+    )
     motion: bool = option(False, help="Cut until the first motion and after the last one.")
     keep_still: int = option(0, help="Still steps that --motion leaves at either end; some teach to settle.")
     threshold: float | None = option(None, help="A joint that moved less is still, as in filter; for --motion.")
@@ -63,10 +67,9 @@ an end is only cut off with --cut_rewards.
                 raise ConfigError(f"Expected --cuts of [start, end], both >= 0, for episode {index}, got {cut}.")
         if self.min_steps < 1:
             raise ConfigError(f"Expected --min_steps >= 1, got {self.min_steps}.")
-        asked = (self.head, self.tail, self.head_seconds, self.tail_seconds, self.motion, self.after_success, self.cuts)
-        if not any(asked):
+        if self == Trim(min_steps=self.min_steps):
             raise ConfigError(
-                "Nothing to trim: give --head, --tail, their seconds, --cuts, --motion or --after_success."
+                "Nothing to trim: give --head, --tail, their seconds, --cuts, --leap, --motion or --after_success."
             )
         self._motion().validate()
 
@@ -93,10 +96,11 @@ an end is only cut off with --cut_rewards.
         rule = self._motion().rule(view)[0] if self.motion else None
         known_episodes(view, self.cuts)
         common = self.head or round(self.head_seconds * view.fps), self.tail or round(self.tail_seconds * view.fps)
+        leaps = self._leaps(view) if self.leap else {}
         after, cut = Selected(view), []
         for index in view.episodes:
             episode = view.episode(index)
-            start, success = 0, self._success(episode)
+            start, success = leaps.get(index, 0), self._success(episode)
             stop = len(episode) if success is None else success + 1
             head, tail = self.cuts.get(index, common)
             start, stop = start + head, stop - tail
@@ -130,6 +134,20 @@ an end is only cut off with --cut_rewards.
         """The sentence for the history."""
         head, tail = (sum(e[k] for e in entry["episodes"]) for k in ("head", "tail"))
         return f"Cut {head} steps off the starts and {tail} off the ends of {len(entry['episodes'])} episodes."
+
+    def _leaps(self, view: "View") -> dict[int, int]:
+        """Steps, by episode, in which the arm is still on its way to the leader; raises DataError for differences."""
+        from ..decisions.joints import match_joints
+        from ..decisions.leaps import Leaps
+
+        if view.deltas is not None:
+            raise DataError("Expected absolute actions for --leap, found differences: trim before delta.")
+        matched, leaps = match_joints(view.features), Leaps()
+        for index in view.episodes:
+            columns = view.episode(index).columns
+            action, state = columns[ACTION][:, list(matched.action_dims)], columns[STATE][:, list(matched.state_dims)]
+            leaps.add(index, action.astype(float), state.astype(float))
+        return {index: steps for index, (steps, *_) in leaps.found().items()}
 
     def _success(self, episode: "Episode") -> int | None:
         """First successful step, if there is one and it matters."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from cqn_data.cli import main
 from cqn_data.decisions.angles import full_turn, turned
 from cqn_data.decisions.joints import match_joints, rate_dims
 from lerobot_cqn.delta_actions import DeltaJoints, description, parse
@@ -246,6 +247,30 @@ def test_commands_that_the_arm_does_not_follow_are_said(tmp_path):
     assert inspect(write_columns(tmp_path / "noise", shaken))["far_commands"].level == "warning"
     cut = [{**e, ACTION: np.concatenate([e[ACTION][:, :2].clip(-1, 1), e[ACTION][:, 2:]], 1)} for e in follows]
     assert "pan.pos" in inspect(write_columns(tmp_path / "cut", cut))["far_commands"].text
+
+
+def test_a_leap_to_the_leader_is_said_and_cut_and_widens_no_bounds(tmp_path):
+    def episode(seed, leap):
+        state = moving(60, seed=seed)
+        command = np.concatenate([state[1:], state[-1:]])
+        state[:leap] += np.float32([0, 80, 0, 0])
+        return {STATE: state, ACTION: command}
+
+    options = ["--repo_id=local/src", "--filter.auto=false", "--filter.threshold=0.001"]
+    widths = {}
+    for name, leap in {"leap": 5, "none": 0}.items():
+        root = write_columns(tmp_path / name, [episode(s, leap if s == 1 else 0) for s in range(4)])
+        assert ("leaps" in inspect(root)) == bool(leap)
+        assert main(["run", "arm_state", *options, f"--root={root}", f"--new_root={tmp_path / name}_clean"]) == 0
+        actions = column(tmp_path / f"{name}_clean", ACTION)[:, :3]
+        widths[name] = np.ptp(actions, axis=0)
+    np.testing.assert_allclose(widths["leap"], widths["none"], rtol=0.2)
+    found = inspect(tmp_path / "leap")["leaps"]
+    assert "episode 1" in found.where
+    assert "for 5 of its steps" in found.text
+    assert (
+        main(["trim", *options[:1], f"--root={tmp_path / 'leap_clean'}", f"--new_root={tmp_path / 'x'}", "--leap"]) == 2
+    )
 
 
 def test_a_gripper_that_flickers_is_said(tmp_path):

@@ -18,10 +18,12 @@ from rich.table import Table
 from ..interfaces import PAGE_TOKEN
 from ..run.metrics import read_rows
 from ..run.progress import last_line
-from .config import ArmDemoConfig
+from .config import ArmDemoConfig, So101DemoConfig
 from .stages import Stages, Watched, fresh, run_once
 
-__all__ = ["main", "run_demo"]
+__all__ = ["arm_progress", "arm_summary", "arm_table", "main", "run_demo"]
+
+AnyArmDemo = ArmDemoConfig | So101DemoConfig
 
 CLOCK = 4  # simulated seconds in a real one
 RATE = 10  # control steps in a simulated second
@@ -29,8 +31,6 @@ RATE = 10  # control steps in a simulated second
 
 def run_demo(config: ArmDemoConfig, console: Console) -> dict[str, Any]:
     """The demo from recording to picture; returns what `summary.json` holds. Raises DemoError when a command fails."""
-    from .figures import arm_session
-
     stages = Stages(config.output_dir, console)
     raw, clean, run = (config.output_dir / name for name in ("data/raw", "data/clean", "run"))
     arm = ("--robot.type=sim_ur5e", f"--robot.speed={CLOCK}", "--robot.state=true", f"--robot.seed={config.seed}")
@@ -49,6 +49,13 @@ def run_demo(config: ArmDemoConfig, console: Console) -> dict[str, Any]:
             "--repo_id=demo/raw", f"--root={raw}", "--new_repo_id=demo/clean", f"--new_root={clean}",
         )  # fmt: skip
         _train(stages, config, clean, run, arm)
+    return arm_summary(stages, config, run)
+
+
+def arm_summary(stages: Stages, config: AnyArmDemo, run: Path) -> dict[str, Any]:
+    """Draw session.png of a finished run, and write and return what `summary.json` holds."""
+    from .figures import arm_session
+
     episodes, evaluations = read_rows(run / "episodes.csv"), read_rows(run / "evaluations.csv")
     summary = {
         "config": {name: str(value) for name, value in vars(config).items()},
@@ -91,15 +98,17 @@ def _train(stages: Stages, config: ArmDemoConfig, data: Path, run: Path, arm: tu
     page = f"http://127.0.0.1:{config.port}/?token={stages.environment[PAGE_TOKEN]}"
     stages.console.print(f"  watch it at the operator's page: {page}", soft_wrap=True)
     training = Watched(
-        process=process, text="online training", total=config.steps, progress=partial(_progress, run, config)
-    )
+        process=process, text="online training", total=config.steps,
+        progress=partial(arm_progress, run, config.eval_episodes),
+    )  # fmt: skip
     stages.watch({"train": training})
 
 
-def _progress(run: Path, config: ArmDemoConfig) -> tuple[int, str]:
+def arm_progress(run: Path, eval_episodes: int) -> tuple[int, str]:
+    """Steps that a run on an arm has made online, and how it goes."""
     episodes, evaluations = read_rows(run / "episodes.csv"), read_rows(run / "evaluations.csv")
     if not evaluations:
-        return 0, f"imitation, then {config.eval_episodes} episodes to evaluate it"
+        return 0, f"imitation, then {eval_episodes} episodes to evaluate it"
     if not episodes:
         return 0, f"success {float(evaluations[-1]['success_rate']):.2f} after imitation"
     lately = [int(row["success"]) for row in episodes[-5:]]
@@ -111,9 +120,9 @@ def _online_minutes(run: Path) -> float:
     return float(progress["counters"]["online_s"]) / 60
 
 
-def show(summary: dict[str, Any], config: ArmDemoConfig, console: Console) -> None:
-    """The short table at the end."""
-    table = Table(title="click_button on the simulated arm, judged by the simulated person", title_justify="left")
+def arm_table(title: str, summary: dict[str, Any], config: AnyArmDemo, console: Console) -> None:
+    """The short table of a session on an arm, and where its files are."""
+    table = Table(title=title, title_justify="left")
     for column, side in (("policy", "left"), ("success", "right"), ("95 % interval", "right")):
         table.add_column(column, justify="right" if side == "right" else "left")
     after = f"after {summary['online_minutes']:.1f} minutes online, {summary['episodes']} episodes"
@@ -126,6 +135,11 @@ def show(summary: dict[str, Any], config: ArmDemoConfig, console: Console) -> No
     console.print(table)
     console.print(f"{summary['control']}\npicture  {config.output_dir / 'session.png'}", soft_wrap=True)
     console.print(f"policy   {config.output_dir / 'run' / 'checkpoints' / 'last' / 'pretrained_model'}")
+
+
+def show(summary: dict[str, Any], config: ArmDemoConfig, console: Console) -> None:
+    """The short table at the end."""
+    arm_table("click_button on the simulated arm, judged by the simulated person", summary, config, console)
 
 
 def main() -> int:

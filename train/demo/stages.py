@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -9,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import draccus
@@ -20,9 +22,13 @@ from lerobot_cqn.errors import CQNError
 
 from ..run.progress import last_line
 
-__all__ = ["DemoError", "Stages", "Watched", "fresh", "run_once"]
+__all__ = ["DemoError", "Stages", "Watched", "await_end", "fresh", "run_once"]
 
 LOG_EVERY_S = 30.0  # between lines where there is no terminal for a bar
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM came."""
 
 
 class DemoError(CQNError):
@@ -92,8 +98,8 @@ class Stages:
             process = self.start(name, module, *arguments)
             try:
                 code = process.wait()
-            except KeyboardInterrupt:  # it has received the signal too, and is tidying up
-                process.wait()
+            except KeyboardInterrupt as stop:
+                await_end(process, stop)
                 raise
             self.check(name, code)
         finished.touch()
@@ -118,12 +124,19 @@ class Stages:
                             self.console.print(f"  {one.text:<26} {done}/{one.total}  {note}")
                     told = time.monotonic() if tell else told
                     time.sleep(1.0)
-            except KeyboardInterrupt:
-                for one in running.values():  # they have received the signal too, and are saving
-                    one.process.wait()
+            except KeyboardInterrupt as stop:
+                for one in running.values():
+                    await_end(one.process, stop)
                 raise
         for name, one in running.items():
             self.check(name, one.process.returncode)
+
+
+def await_end(process: subprocess.Popen[bytes], stop: KeyboardInterrupt) -> None:
+    """Wait until a command has tidied up: Ctrl-C at the terminal has reached it, too; SIGTERM is handed on."""
+    if isinstance(stop, Terminated):
+        process.terminate()
+    process.wait()
 
 
 def fresh(run: Path) -> Path:
@@ -131,6 +144,10 @@ def fresh(run: Path) -> Path:
     if run.exists():
         run.rename(run.with_name(f"{run.name}-unfinished-{int(time.time())}"))
     return run
+
+
+def _terminated(number: int, frame: FrameType | None) -> None:
+    raise Terminated
 
 
 def run_once(
@@ -145,6 +162,7 @@ def run_once(
     Returns 0, 2 for an error of the user's or of a command, 130 after an interrupt.
     """
     console = Console(highlight=False)
+    signal.signal(signal.SIGTERM, _terminated)
     try:
         config: Any = draccus.parse(kind)
         finished = config.output_dir / "summary.json"

@@ -3,16 +3,20 @@
 python -m cqn_train.sim_arm.keyboard lerobot-record --robot.type=sim_ur5e --teleop.type=sim_leader ...
 """
 
+import codecs
+import contextlib
 import os
 import pty
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-__all__ = ["RECORD_KEYS", "Terminal"]
+__all__ = ["NEXT", "RECORD_KEYS", "Terminal"]
 
+LOOK_S = 0.02  # between two looks at what it has said
 NEXT = b"n"  # lerobot-record's key in a terminal: the episode, or the reset, is over
 # What the simulated leader prints, and the key that a person presses then: the task is done, or the arm is home.
 RECORD_KEYS: Mapping[str, bytes] = {"sim_leader: home": NEXT, "sim_leader: wait": NEXT}
@@ -26,37 +30,72 @@ class Terminal:
         process: the command.
     """
 
-    def __init__(self, command: Sequence[str], folder: Path | None = None) -> None:
+    def __init__(
+        self, command: Sequence[str], folder: Path | None = None, environment: Mapping[str, str] | None = None
+    ) -> None:
         """Start it in `folder` (the present one), without the network and without a display."""
         self.name = command[0]
         self._master, slave = pty.openpty()
-        environment = {**os.environ, "HF_HUB_OFFLINE": "1", "DISPLAY": "", "TERM": "dumb"}
         self.process = subprocess.Popen(
-            list(command), stdin=slave, stdout=slave, stderr=slave, cwd=folder, env=environment, close_fds=True
-        )
+            list(command), stdin=slave, stdout=slave, stderr=slave, cwd=folder, close_fds=True,
+            env={**os.environ, **(environment or {}), "HF_HUB_OFFLINE": "1", "DISPLAY": "", "TERM": "dumb"},
+        )  # fmt: skip
         os.close(slave)
-        self.said = ""
+        self.said, self._heard = "", 0
+        self._reader = threading.Thread(target=self._read, name="terminal", daemon=True)
+        self._reader.start()
+
+    def press(self, keys: bytes) -> None:
+        """Press keys; does nothing where the command has ended."""
+        with contextlib.suppress(OSError):
+            os.write(self._master, keys)
+
+    def hears(self, text: str, seconds: float = 90.0) -> None:
+        """Wait until it says something that was not heard before.
+
+        Raises:
+            TimeoutError: it did not within so many seconds.
+            ChildProcessError: it ended without.
+        """
+        deadline = time.monotonic() + seconds
+        while (place := self.said.find(text, self._heard)) < 0:
+            over = not self._reader.is_alive()  # asked first: it may say something meanwhile
+            if over and text not in self.said[self._heard :]:
+                raise ChildProcessError(f"{self.name} ended without '{text}': {self.said[-2000:]}")
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"{self.name} did not say '{text}' within {seconds:.0f} s: {self.said[-2000:]}")
+            time.sleep(LOOK_S)
+        self._heard = place + len(text)
+
+    def ends(self, seconds: float) -> int:
+        """Wait for its end; returns the exit code. Raises TimeoutError after `seconds`, when it is killed."""
+        try:
+            return self.process.wait(seconds)
+        except subprocess.TimeoutExpired as error:
+            self.process.kill()
+            raise TimeoutError(f"{self.name} did not end within {seconds:.0f} s.") from error
+        finally:
+            self._reader.join(5)
 
     def run(self, answers: Mapping[str, bytes], seconds: float) -> int:
         """Press keys at the lines that ask for them; returns the exit code. Raises TimeoutError after `seconds`."""
-        deadline, unread = time.monotonic() + seconds, ""
-        try:
-            while True:
-                if time.monotonic() > deadline:
-                    self.process.kill()
-                    raise TimeoutError(f"{self.name} did not end within {seconds:.0f} s.")
-                try:
-                    data = os.read(self._master, 4096).decode(errors="replace")
-                except OSError:  # the other end is closed
-                    return self.process.wait(30)
-                self.said += data
-                *lines, unread = (unread + data).split("\n")
-                for line in lines:
-                    for text, key in answers.items():
-                        if text in line:
-                            os.write(self._master, key)
-        finally:
-            os.close(self._master)
+        deadline, seen = time.monotonic() + seconds, 0
+        while self._reader.is_alive() and time.monotonic() < deadline:
+            time.sleep(LOOK_S)
+            *lines, rest = (new := self.said[seen:]).split("\n")
+            seen += len(new) - len(rest)
+            for line in lines:
+                for text, key in answers.items():
+                    if text in line:
+                        self.press(key)
+        return self.ends(max(deadline - time.monotonic(), 0.0))
+
+    def _read(self) -> None:
+        decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")
+        with contextlib.suppress(OSError):  # the other end is closed
+            while data := os.read(self._master, 4096):
+                self.said += decoder.decode(data)
+        os.close(self._master)
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -5,17 +5,32 @@ import os
 import threading
 import urllib.error
 import urllib.request
-from typing import Any
+from typing import Any, Protocol
 
+from ..clock import Clock
 from ..interfaces import PAGE_TOKEN
-from .world import World
 
-__all__ = ["SimPerson"]
+__all__ = ["Scene", "SimPerson"]
 
 LOOK_S = 0.03
 RETRY_S = 0.2
 LOST_S = 3.0  # simulated seconds after which an arm that does not set off for home by itself is sent there
 SURE_S = 0.2  # simulated seconds for which the task must look done
+
+
+class Scene(Protocol):
+    """What a person sees: now, seconds; success, whether the task is done; away, whether the arm has left home and
+    neither come back nor has the scene been laid out anew; clock: by which time passes for the person.
+    """
+
+    clock: Clock
+    now: float
+
+    @property
+    def success(self) -> bool: ...
+
+    @property
+    def away(self) -> bool: ...
 
 
 class SimPerson:
@@ -24,8 +39,8 @@ class SimPerson:
     What it knows is what a person sees: whether the task is done and whether the arm is home.
     """
 
-    def __init__(self, world: World, url: str, takes_over_s: float = 0.0, helps_episodes: int = 0) -> None:
-        """Watch a world and answer at `url` (http://host:port), with the token of CQN_PAGE_TOKEN.
+    def __init__(self, world: Scene, url: str, takes_over_s: float = 0.0, helps_episodes: int = 0) -> None:
+        """Watch a scene and answer at `url` (http://host:port), with the token of CQN_PAGE_TOKEN.
 
         takes_over_s: simulated seconds of an episode after which it takes the leader, until the task is done; 0: never.
         helps_episodes: how many episodes of the run it does so in, at their beginning; 0: all. A policy that is always

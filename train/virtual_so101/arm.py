@@ -6,33 +6,32 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from .chain import Chain
+from .chain import Body, Chain
+from .joints import JOINTS, SPANS
 from .servo import TURN, Servo
 
-__all__ = ["JOINTS", "assembled", "at_middle", "hand_sweep", "hand_wave"]
+__all__ = ["assembled", "at_middle", "hand_sweep", "hand_wave"]
 
-JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
-# Steps that each joint can turn in all, of the published model's limits (SO-ARM100, so101_new_calib); the roll is free.
-SPANS = dict(zip(JOINTS, (2502, 2275, 2204, 2161, 4095, 1252), strict=True))
 SAGS = {"shoulder_lift": 6.0, "elbow_flex": 5.0, "wrist_flex": 2.0}  # steps at the factory's gain
 TICK_S = 0.01
 HOLD_S = 0.1  # at each end
 
 
-def assembled(seed: int, *, numbered: bool = True) -> Chain:
-    """A chain of six motors, each mounted at another angle of its encoder, at rest in the middle of its joint.
+def assembled(seed: int, *, numbered: bool = True, body: Body | None = None, speed: float = 1.0) -> Chain:
+    """A chain of six motors, each mounted at another angle of its encoder; a person holds each joint in its middle.
 
-    numbered: with the ids 1 to 6; else all as delivered, with 1.
+    numbered: with the ids 1 to 6; else all as delivered, with 1. body, speed: of `Chain`.
     """
     rng, servos = np.random.default_rng(seed), []
     for number, joint in enumerate(JOINTS, start=1):
         span = SPANS[joint]
         low = float(rng.integers(0, TURN - span)) if span < TURN - 1 else 0.0
-        servo = Servo(shaft=low + span / 2, ends=(low, low + span), sag=SAGS.get(joint, 0.0))
+        sag = SAGS.get(joint, 0.0) if body is None else 0.0
+        servo = Servo(shaft=low + span / 2, ends=(low, low + span), sag=sag, hand=low + span / 2)
         if numbered:
             servo.renumber(number)
         servos.append(servo)
-    return Chain(servos)
+    return Chain(servos, body, speed)
 
 
 def at_middle(chain: Chain, joint: str) -> float:

@@ -4,10 +4,11 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Protocol
 
 from .servo import POSITION, Servo
 
-__all__ = ["Chain", "Fault", "FaultKind", "packet"]
+__all__ = ["Body", "Chain", "Fault", "FaultKind", "packet"]
 
 BROADCAST = 0xFE
 PING, READ, WRITE, REG_WRITE, ACTION, SYNC_READ, SYNC_WRITE = 1, 2, 3, 4, 5, 0x82, 0x83
@@ -51,8 +52,18 @@ def packet(number: int, code: int, parameters: bytes = b"") -> bytes:
     return b"\xff\xff" + body + bytes([~sum(body) & 0xFF])
 
 
+class Body(Protocol):
+    """What the servos of a chain move, and what resists them."""
+
+    def move(self, servos: Sequence[Servo], seconds: float) -> None:
+        """Let time pass for them."""
+        ...
+
+
 class Chain:
     """Servos behind one port; safe to use from several threads.
+
+    body: what they move; None: nothing that resists. speed: their seconds in a real one.
 
     Attributes:
         servos: in the order of the wire.
@@ -60,8 +71,8 @@ class Chain:
         faults: of the answers, present ones.
     """
 
-    def __init__(self, servos: Sequence[Servo]) -> None:
-        self.servos = list(servos)
+    def __init__(self, servos: Sequence[Servo], body: Body | None = None, speed: float = 1.0) -> None:
+        self.servos, self.body, self.speed = list(servos), body, speed
         self.plugged: frozenset[int] = frozenset(range(len(self.servos)))
         self.faults: list[Fault] = []
         self.lock = threading.RLock()
@@ -69,10 +80,13 @@ class Chain:
         self._waiting: dict[int, tuple[int, bytes]] = {}  # by place: what REG_WRITE left for ACTION
 
     def tick(self, seconds: float) -> None:
-        """Let time pass for all of them."""
+        """Let real time pass for all of them."""
         with self.lock:
+            if self.body is not None:
+                self.body.move(self.servos, seconds * self.speed)
+                return
             for servo in self.servos:
-                servo.tick(seconds)
+                servo.tick(seconds * self.speed)
 
     def take(self, data: bytes, baud: int) -> list[tuple[float, bytes]]:
         """Bytes that came in at a rate; returns the answers, each with the seconds after which it comes."""

@@ -1,6 +1,7 @@
 """`cqn-virtual-so101`: virtual arms at serial ports, and a person's hands on them, told what to do line by line."""
 
 import argparse
+import re
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -10,19 +11,26 @@ from pathlib import Path
 from lerobot_cqn.errors import ConfigError, CQNError, one_of
 
 from ..run.stop import StopRequest
-from .arm import JOINTS, assembled, hand_sweep, hand_wave
+from .arm import hand_sweep, hand_wave
+from .bench import SERVED, Bench, BenchConfig
 from .chain import Fault, FaultKind
-from .port import VirtualPort
+from .joints import JOINTS
+from .tasks import TASKS
 
 __all__ = ["main"]
 
 WAVE = {"shoulder_pan": 500.0, "shoulder_lift": 350.0, "elbow_flex": 350.0, "gripper": 400.0}  # steps
+AT_TABLE = ("show", "home", "scene")
+VERBS = ("only", "all", "sweep", "wave", "unplug", "plug", "fault", "mend")
 LOOK_S = 0.05
 HELP = """lines on the standard input, ARM being leader or follower:
   only ARM JOINT          connect the board to one motor only, as lerobot-setup-motors asks for
   all ARM                 connect all of them again
   sweep ARM               move every joint through its range, as lerobot-calibrate asks for
   wave ARM SECONDS        move the arm by hand, as a demonstration does
+  show                    lead the leader through the task at the table, with pauses, and say whether it is done
+  home                    lead the leader back home
+  scene                   lay a new scene out; it happens by itself when the follower has come home
   unplug ARM / plug ARM   pull the cable out and put it in again (the port may have another name then)
   fault ARM KIND [MOTOR [COUNT]]
                           let answers go wrong: silent, late, corrupt, checksum, doubled, overflow, overload, overheat
@@ -31,7 +39,8 @@ HELP = """lines on the standard input, ARM being leader or follower:
   quit                    switch off
 Without lines the arms stay on until Ctrl-C.
 
-  cqn-virtual-so101 --follower=/dev/ttyACM0 --leader=/dev/ttyACM1 --new"""
+  cqn-virtual-so101 --follower=/dev/ttyACM0 --leader=/dev/ttyACM1 --new
+  cqn-virtual-so101 --task=press_button --cameras=5555     # with a table; pictures for LeRobot's cameras of type zmq"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,18 +52,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for arm in ("follower", "leader"):
         parser.add_argument(f"--{arm}", nargs="?", const="", metavar="NAME", help="a port, also under this new name")
     parser.add_argument("--new", action="store_true", help="motors as delivered: all have the id 1")
+    parser.add_argument("--task", choices=sorted(TASKS), help="a table with this to do under the follower, in MuJoCo")
+    parser.add_argument("--spread", type=float, metavar="M", help="how far from the middle its things lie, 0 to 0.04 m")
+    parser.add_argument("--cameras", type=int, metavar="PORT", help=f"pictures by {' and '.join(SERVED)} at this port")
+    parser.add_argument("--picture", default="160x120", metavar="WxH", help="their size in pixels (160x120)")
+    parser.add_argument("--fps", type=float, default=15.0, help="pictures of each camera in a second, 1 to 60 (15)")
+    parser.add_argument("--speed", type=float, default=1.0, help="seconds at the table in a real one, 0.1 to 8 (1)")
+    parser.add_argument("--seed", type=int, default=0, help="of scenes and of the hand (0)")
     given = parser.parse_args(arguments)
-    names = {arm: getattr(given, arm) for arm in ("follower", "leader") if getattr(given, arm) is not None}
-    if not names:
-        names = {"follower": "", "leader": ""}
     try:
         with ExitStack() as stack:
-            ports = {arm: stack.enter_context(_port(arm, name, new=given.new)) for arm, name in names.items()}
+            bench = stack.enter_context(Bench.on(_config(given)))
             should_stop = stack.enter_context(StopRequest())
-            for arm, port in ports.items():
+            for arm, port in bench.ports.items():
                 print(f"{arm}: {port.link or port.name}", flush=True)  # noqa: T201
+            if given.cameras is not None:
+                said = f"type: zmq, server_address: 127.0.0.1, port: {given.cameras}, camera_name: front"
+                print(f"cameras: {{{said}}}, and wrist", flush=True)  # noqa: T201
             off = threading.Event()
-            threading.Thread(target=_lines, args=(ports, off), daemon=True).start()
+            threading.Thread(target=_lines, args=(bench, off), daemon=True).start()
             while not should_stop() and not off.wait(LOOK_S):
                 pass
     except CQNError as error:
@@ -63,32 +79,46 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _port(arm: str, name: str, *, new: bool) -> VirtualPort:
-    link = Path(name) if name else None
-    if link is not None and (link.exists() or link.is_symlink()):
-        raise ConfigError(f"--{arm}={name} exists: give a name that is free, or none.")
-    if link is not None and not link.parent.is_dir():
-        raise ConfigError(f"--{arm}={name}: there is no folder {link.parent}.")
-    return VirtualPort(assembled(len(arm), numbered=not new), link)
+def _config(given: argparse.Namespace) -> BenchConfig:
+    """What is asked for. Raises ConfigError for values that cannot be."""
+    links = {arm: getattr(given, arm) for arm in ("follower", "leader") if getattr(given, arm) is not None}
+    size = re.fullmatch(r"(\d{2,3})x(\d{2,3})", given.picture)
+    if size is None:
+        raise ConfigError(f"--picture={given.picture}: expected width x height, as 160x120.")
+    width, height = map(int, size.groups())
+    return BenchConfig(
+        links={arm: Path(name) if name else None for arm, name in (links or {"follower": "", "leader": ""}).items()},
+        task=given.task, spread_m=given.spread, numbered=not given.new, speed=given.speed, cameras=given.cameras,
+        size=(height, width), fps=given.fps, seed=given.seed,
+    )  # fmt: skip
 
 
-def _lines(ports: dict[str, VirtualPort], off: threading.Event) -> None:
+def _lines(bench: Bench, off: threading.Event) -> None:
     for line in sys.stdin:
         words = line.split()
         if words == ["quit"]:
             off.set()
             return
         try:
-            said = _obey(ports, words) if words else ""
+            said = _obey(bench, words) if words else ""
         except (CQNError, OSError) as error:
             said = f"error: {error}"
         if said:
             print(said, flush=True)  # noqa: T201
 
 
-def _obey(ports: dict[str, VirtualPort], words: Sequence[str]) -> str:
+def _obey(bench: Bench, words: Sequence[str]) -> str:
     """Do what a line says; returns what to answer. Raises ConfigError for a line that cannot be understood."""
     verb, *rest = words
+    ports = bench.ports
+    if verb not in (*AT_TABLE, *VERBS, "state", "quit"):
+        raise ConfigError(one_of("line", verb, [*AT_TABLE, *VERBS, "state", "quit"]))
+    if verb in AT_TABLE:
+        table, demonstrator = bench.at_table()
+        if verb == "show":
+            return f"show: done, {'a success' if demonstrator.show() else 'not a success'}"
+        (demonstrator.home if verb == "home" else table.lay_out)()
+        return f"{verb}: done"
     if verb == "state":
         return "\n".join(
             f"{arm}: " + ", ".join(f"{j} {s.shaft:.0f}" for j, s in zip(JOINTS, port.chain.servos, strict=True))
@@ -108,8 +138,6 @@ def _obey(ports: dict[str, VirtualPort], words: Sequence[str]) -> str:
         "fault": lambda: chain.faults.append(_fault(more)),
         "mend": chain.faults.clear,
     }
-    if verb not in verbs:
-        raise ConfigError(one_of("line", verb, [*verbs, "state", "quit"]))
     verbs[verb]()
     return f"{verb}: done" + (f", {port.link or port.name}" if verb == "plug" else "")
 

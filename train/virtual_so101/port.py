@@ -15,6 +15,7 @@ from .chain import Chain
 
 __all__ = ["VirtualPort"]
 
+URGENT = -15  # nice value: a driver waits 50 ms for an answer, and LeRobot's commands do not ask twice
 LOOK_S = 0.002  # between two looks at the wire, in which the motors move
 RATES = {  # that a terminal has names for: at others nobody answers
     termios.B1000000: 1_000_000, termios.B500000: 500_000, termios.B115200: 115_200, termios.B57600: 57_600,
@@ -75,6 +76,8 @@ class VirtualPort:
         self._thread = self._ends = None
 
     def _run(self, near: int, far: int) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # servos do not wait for a busy machine; needs the right to
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), URGENT)
         late: list[tuple[float, bytes]] = []
         before = time.monotonic()
         while not self._closing.is_set():

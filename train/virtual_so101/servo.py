@@ -52,7 +52,7 @@ class Servo:
     Attributes:
         shaft: where the shaft is, in steps of its own encoder; counts on over several turns.
         ends: between which steps the joint lets it turn.
-        sag: steps by which gravity pulls it off its goal at the factory's gain (32).
+        sag: steps by which gravity pulls it off its goal at the factory's gain (32), where no simulation knows better.
         hand: steps to which a person turns it while its torque is off; None: nobody does.
     """
 
@@ -61,6 +61,8 @@ class Servo:
     sag: float = 0.0
     hand: float | None = None
     velocity: float = 0.0
+    _reference: float | None = None  # steps of the shaft where it means to be just now; None: torque off
+    _pace: float = 0.0  # of the reference, steps/s
     _table: bytearray = field(default_factory=lambda: bytearray(SIZE))
     _kept: bytes = b""
 
@@ -89,6 +91,11 @@ class Servo:
     def torque(self) -> bool:
         """Whether it holds and moves."""
         return self._get(TORQUE) == 1
+
+    @property
+    def gain(self) -> float:
+        """Stiffness, as a share of what LeRobot sets (P of 16)."""
+        return self._get(P_GAIN) / 16
 
     @property
     def goal(self) -> int:
@@ -127,28 +134,47 @@ class Servo:
         """Off and on: what was not saved is what it was, and the torque is off."""
         self._table[:] = self._kept
         self._put(GOAL, self._position())
-        self.velocity = 0.0
+        self.velocity, self._reference = 0.0, None
 
     def tick(self, seconds: float) -> None:
-        """Let time pass: towards the goal at the allowed speed and acceleration, or as the hand turns it."""
-        before = self.shaft
-        if self.torque:
-            self._drive(seconds)
-        elif self.hand is not None:
-            reach = HAND_SPEED * seconds
-            self.shaft += min(max(self.hand - self.shaft, -reach), reach)
-        self.shaft = min(max(self.shaft, self.ends[0]), self.ends[1])
-        self.velocity = (self.shaft - before) / seconds if seconds > 0 else self.velocity
+        """Let time pass where nothing resists: as it means to move, or as the hand turns it."""
+        wanted = self.plan(seconds)
+        self.moved(self.turned_by_hand(seconds) if wanted is None else wanted, seconds)
 
-    def _drive(self, seconds: float) -> None:
+    def plan(self, seconds: float) -> float | None:
+        """Steps of the shaft where it means to be after some time, at the allowed speed and acceleration.
+
+        None with its torque off.
+        """
+        if not self.torque:
+            self._reference = None
+            return None
+        self.hand = None  # whoever held it has let go
+        if self._reference is None:
+            self._reference, self._pace = self.shaft, self.velocity
         fastest = min(float(abs(self._signed(GOAL_VELOCITY)) or FASTEST), FASTEST)
         push = 100.0 * (self._get(ACCELERATION) or 254)  # steps/s^2
-        rest = self._rest() - self.shaft
+        rest = self._rest() - self._reference
         # As fast as it can still brake from, and no faster than it can become in this time.
         wanted = math.copysign(min(fastest, math.sqrt(2 * push * abs(rest))), rest)
-        speed = self.velocity + min(max(wanted - self.velocity, -push * seconds), push * seconds)
-        step = speed * seconds
-        self.shaft += rest if abs(step) >= abs(rest) and step * rest > 0 else step
+        self._pace += min(max(wanted - self._pace, -push * seconds), push * seconds)
+        step = self._pace * seconds
+        if abs(step) >= abs(rest) and step * rest >= 0:
+            self._reference, self._pace = self._reference + rest, 0.0
+        else:
+            self._reference += step
+        self._reference = min(max(self._reference, self.ends[0]), self.ends[1])
+        return self._reference
+
+    def turned_by_hand(self, seconds: float) -> float:
+        """Steps of the shaft where a person has turned it after some time."""
+        reach = HAND_SPEED * seconds
+        return self.shaft + (min(max(self.hand - self.shaft, -reach), reach) if self.hand is not None else 0.0)
+
+    def moved(self, shaft: float, seconds: float) -> None:
+        """Say where the shaft has come to meanwhile."""
+        before, self.shaft = self.shaft, min(max(shaft, self.ends[0]), self.ends[1])
+        self.velocity = (self.shaft - before) / seconds if seconds > 0 else self.velocity
 
     def _rest(self) -> float:
         """Where it would come to rest, in steps of the shaft."""
