@@ -9,9 +9,12 @@ import pytest
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import make_pre_post_processors
+from lerobot.robots.config import RobotConfig
+from lerobot.robots.utils import make_robot_from_config
 
 from cqn_train.agent import Agent
-from cqn_train.arm.build import _check_home, check_robot_fits, home_of, limits_of
+from cqn_train.arm.build import _check_home, check_commands, check_robot_fits, home_of, limits_of
+from cqn_train.arm.devices import register_devices
 from cqn_train.config import DatasetSettings
 from cqn_train.replay.demonstrations import Demonstrations
 from cqn_train.robot.limits import Limits
@@ -198,6 +201,44 @@ def test_another_robot_is_refused(changes: dict[str, Any], said: str, tmp_path: 
     }
     with pytest.raises(ConfigError, match=said):
         check_robot_fits(robot(**changes), agent(tmp_path, DELTAS, deltas=True, inputs=both))
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "said"),
+    [
+        ("so101_follower", {"port": "/dev/none"}, ""),
+        (
+            "lekiwi_client",
+            {"remote_ip": "127.0.0.1"},
+            "takes x.vel, y.vel, theta.vel, by their names no positions",
+        ),
+        ("lekiwi", {}, "lekiwi takes x.vel, y.vel, theta.vel"),
+        ("earthrover_mini_plus", {}, "takes linear_velocity, angular_velocity"),
+    ],
+)
+def test_lerobots_robots_that_drive_are_refused_by_name(kind: str, settings: dict[str, Any], said: str) -> None:
+    """A hold would go on with the last velocity."""
+    if kind.startswith("lekiwi"):
+        pytest.importorskip("zmq")
+    pytest.importorskip("scservo_sdk")
+    register_devices()
+    made = make_robot_from_config(RobotConfig.get_choice_class(kind)(**settings))
+    if not said:
+        check_commands(made)
+        return
+    with pytest.raises(ConfigError, match=said):
+        check_commands(made)
+
+
+def test_a_joint_that_is_moved_unread_is_refused_by_name() -> None:
+    """As a third party's simulated arm has it: `gripper.value` is commanded, `gripper.pos` is read."""
+    names = dict.fromkeys(("lift.pos", "gripper.pos"), float)
+    arm = robot(action_features=dict.fromkeys(("lift.pos", "gripper.value"), float), observation_features=names)
+    arm.name = "hex"
+    with pytest.raises(
+        ConfigError, match=r"hex takes gripper.value, but its observation has only lift.pos, g"
+    ):
+        check_commands(arm)
 
 
 def test_what_only_a_simulator_gives_is_refused(tmp_path: Path) -> None:

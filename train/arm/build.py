@@ -17,6 +17,7 @@ from lerobot.teleoperators.utils import make_teleoperator_from_config
 from lerobot.utils.constants import ACTION, OBS_STATE
 from numpy.typing import NDArray
 
+from cqn_data.decisions.joints import no_positions
 from cqn_data.web.access import ANY_ADDRESS
 from cqn_data.web.server import own_address
 from cqn_data.web.tls import Certificate, check_certificate, own_certificate
@@ -71,6 +72,7 @@ def make_operated(
     """
     robot = _made("robot", make_robot_from_config, robot_config)
     leader = _made("teleop", make_teleoperator_from_config, config.teleop) if config.teleop is not None else None
+    check_commands(robot)
     check_robot_fits(robot, agent)
     if demonstrations is not None:
         _check_names(robot, demonstrations.meta.features)
@@ -150,6 +152,21 @@ def recall(board: Board, output_dir: Path) -> None:
         for row in read_rows(output_dir / f"{table}.csv"):
             numbers = {f"{table}/{name}": text for name, text in row.items() if text and name != "phase"}
             board.log({name: float(text) for name, text in numbers.items()})
+
+
+def check_commands(robot: Robot) -> None:
+    """An arm must be moved by positions that it can be read at. Raises ConfigError by name where it is not."""
+    names, states = list(robot.action_features), state_names(robot)
+    if others := [names[i] for i in no_positions(names)]:
+        raise ConfigError(
+            f"--robot.type={robot.name} takes {', '.join(others)}, by their names no positions: to hold such a "
+            "robot would be to drive on. cqn-train moves arms by joint positions only."
+        )
+    if unread := [name for name in names if name not in states]:
+        raise ConfigError(
+            f"--robot.type={robot.name} takes {', '.join(unread)}, but its observation has only {', '.join(states)}: "
+            "each joint that is moved must be read under the same name."
+        )
 
 
 def check_robot_fits(robot: Robot, agent: Agent) -> None:
