@@ -235,9 +235,7 @@ def test_a_joint_that_is_moved_unread_is_refused_by_name() -> None:
     names = dict.fromkeys(("lift.pos", "gripper.pos"), float)
     arm = robot(action_features=dict.fromkeys(("lift.pos", "gripper.value"), float), observation_features=names)
     arm.name = "hex"
-    with pytest.raises(
-        ConfigError, match=r"hex takes gripper.value, but its observation has only lift.pos, g"
-    ):
+    with pytest.raises(ConfigError, match=r"hex takes gripper.value, but its observation has only lift.pos, g"):
         check_commands(arm)
 
 
