@@ -5,24 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from ..release.compatibility import Bench, console_scripts, forgotten
-from ..release.document import PAGE, read_section
+from ..release.compatibility import Bench, console_scripts, differences, forgotten, stated
+from ..release.document import PAGE
 from ..release.environments import Done
 from ..release.lerobot_rows import SECTIONS
-from ..release.rows import NOT, UNCONCERNED, WORKS, Row, Try, ends_well, judge_row, says, writes
+from ..release.rows import NOT, UNCONCERNED, WORKS, Outcome, Row, Try, ends_well, judge_row, says, writes
 
 ROWS = [row for rows in SECTIONS.values() for row in rows]
 CHEAP = ("lerobot-find-joint-limits", "lerobot-setup-motors")
-
-
-def stated(row: Row) -> str:
-    """The verdict of the page for a row, found by what was run."""
-    shown = [one.shown or one.line for one in row.tries]
-    for line in read_section("commands"):
-        cells = [cell.strip() for cell in line.split(" | ")]
-        if cells[0] == f"| `{row.command}`" and cells[2].strip("`").replace("\\|", "|") in shown:
-            return cells[1]
-    return ""
 
 
 def test_every_command_of_lerobot_is_tried() -> None:
@@ -59,3 +49,14 @@ def test_the_verdict_follows_from_what_happens(tmp_path: Path) -> None:
     assert writes("nothing.txt")(good, tmp_path)
     assert says("other words")(good, tmp_path)
     assert says("fi.e")(good, tmp_path) == ""
+
+
+def test_another_lerobot_is_told_by_what_comes_out_otherwise(tmp_path: Path) -> None:
+    row = next(row for row in ROWS if stated(row) == WORKS)
+    as_before = Outcome(row, WORKS, row.tries[0].line, "")
+    assert differences({"a": [as_before]}, ()) == []
+    (line, other) = differences({"a": [Outcome(row, NOT, row.tries[0].line, "It ends.")]}, ["lerobot-new"])
+    assert line == "no row tries lerobot-new"
+    assert other.endswith("does not, the page says works. It ends.")
+    (tmp_path / "pyproject.toml").write_text('[project]\nscripts = {"lerobot-new" = "a:b", "lerobot-train" = "c:d"}\n')
+    assert forgotten(tmp_path) == {"lerobot-new"}

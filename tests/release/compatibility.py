@@ -1,10 +1,11 @@
 """Runs every command of LeRobot with the policy and writes docs/compatibility.md: `make compatibility`.
 
-python -m tests.release.compatibility [--only TEXT ...]
+python -m tests.release.compatibility [--only TEXT ...] [--lerobot FOLDER]
 
 Needs the network for packages. All of it happens in a temporary environment with the wheel and the extras of LeRobot
 that some commands need. With `--only`, rows whose line contains one of the texts are run
-anew, and the others stay on the page as they are.
+anew, and the others stay on the page as they are. With `--lerobot`, LeRobot is installed from a source tree: the page
+stays as it is, and what came out otherwise than it says is listed.
 """
 
 import argparse
@@ -12,7 +13,8 @@ import json
 import shutil
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+import tomllib
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from importlib.metadata import entry_points, version
 from pathlib import Path
@@ -44,16 +46,37 @@ MANIPULATOR = {
 }
 
 
-def console_scripts() -> set[str]:
-    """Commands of the installed LeRobot."""
+def console_scripts(tree: Path | None = None) -> set[str]:
+    """Commands of the installed LeRobot, or of a source tree."""
+    if tree is not None:
+        return set(tomllib.loads((tree / "pyproject.toml").read_text(encoding="utf-8"))["project"]["scripts"])
     return {
         point.name for point in entry_points(group="console_scripts") if point.dist and point.dist.name == "lerobot"
     }
 
 
-def forgotten() -> set[str]:
-    """Commands of the installed LeRobot that no row tries."""
-    return console_scripts() - {row.command for rows in SECTIONS.values() for row in rows}
+def forgotten(tree: Path | None = None) -> set[str]:
+    """Commands of LeRobot that no row tries."""
+    return console_scripts(tree) - {row.command for rows in SECTIONS.values() for row in rows}
+
+
+def stated(row: Row) -> str:
+    """The verdict of the page for a row, found by what was run; nothing where it is not there."""
+    shown = [one.shown or one.line for one in row.tries]
+    for line in read_section("commands"):
+        cells = [cell.strip() for cell in line.split(" | ")]
+        if cells[0] == f"| `{row.command}`" and cells[2].strip("`").replace("\\|", "|") in shown:
+            return cells[1]
+    return ""
+
+
+def differences(outcomes: Mapping[str, Sequence[Outcome]], missing: Collection[str]) -> list[str]:
+    """Lines on what is otherwise than the page says, for another LeRobot; missing: commands that no row tries."""
+    lines = [f"no row tries {name}" for name in sorted(missing)]
+    for one in (one for found in outcomes.values() for one in found):
+        if (before := stated(one.row)) != one.verdict:
+            lines += [f"{one.line}: {one.verdict}, the page says {before or 'nothing'}. {one.remark}"]
+    return lines
 
 
 class Bench:
@@ -132,9 +155,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run it all."""
     parser = argparse.ArgumentParser(prog="make compatibility", description=__doc__.splitlines()[0])
     parser.add_argument("--only", nargs="+", metavar="TEXT", help="rows that contain one of these; the others stay")
+    parser.add_argument(
+        "--lerobot", type=Path, metavar="FOLDER", help="a source tree of LeRobot instead of its release"
+    )
     options = parser.parse_args(arguments)
     console = Console(width=None if sys.stdout.isatty() else 200)
-    if names := forgotten():
+    tree = options.lerobot and options.lerobot.resolve()
+    if tree and not (tree / "pyproject.toml").is_file():
+        console.print(f"--lerobot={options.lerobot}: expected a source tree of LeRobot, found no pyproject.toml")
+        return 2
+    if (names := forgotten()) and not tree:
         console.print(f"no row tries {', '.join(sorted(names))}: add them to tests/release/lerobot_rows.py")
         return 1
     with tempfile.TemporaryDirectory(prefix="cqn-compatibility-") as name:
@@ -143,7 +173,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             wheel = build(clean_copy(folder / "source"), "wheel", folder / "wheel")
             environment = Environment(folder)
             wanted = f"{SETTINGS['project']['name']}[sim] @ {wheel.as_uri()}"
-            environment.make(sys.executable, [wanted, f"lerobot[{','.join(EXTRAS)}]=={version('lerobot')}"])
+            lerobot = f"lerobot[{','.join(EXTRAS)}]" + (f" @ {tree.as_uri()}" if tree else f"=={version('lerobot')}")
+            environment.make(sys.executable, [wanted, lerobot])
         write_zarr(folder / "small.zarr")
         bench = Bench(environment.place / "bin", environment.user, environment.variables)
         with console.status("preparing datasets"):
@@ -167,6 +198,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 console.print(
                     f"{outcome.verdict:<12} {escape(outcome.line[:120])}\n             {escape(outcome.remark)}"
                 )
+    if tree:
+        found = differences(outcomes, forgotten(tree))
+        console.print("\n".join(["", *found]) if found else "\nas the page says", markup=False)
+        return int(bool(found))
     lines = page(outcomes)
     if options.only:
         new = {line.rpartition(" | ")[0].split(" | ", 2)[-1]: line for line in lines if line.startswith("| `")}

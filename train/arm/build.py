@@ -1,6 +1,7 @@
 """Parts of a run on an arm, checked to fit one another: robot, leader, limits, home, page or keys."""
 
 import contextlib
+import dataclasses
 import os
 import sys
 from collections.abc import Callable
@@ -45,6 +46,7 @@ Array = NDArray[np.float64]
 ABSOLUTE_SHARE = 0.05
 LEAST_STEP = 0.1  # of the largest step of a joint
 FAR_LIMIT = 10.0  # times the demonstrated range: degrees are 57 radians
+LIMP = "disable_torque_on_disconnect"  # as LeRobot's arms call it
 CURRENT_S = 0.3  # that a reading may be old, and no less than two control steps
 
 
@@ -94,12 +96,20 @@ def make_operated(
         )
     session = Session(leader=leader is not None, can_free=arm.guard.can_release)
     board = Board(session, clock=clock)
-    if config.arm.on_exit == "hold" and getattr(robot_config, "disable_torque_on_disconnect", False):
+    if config.arm.on_exit == "hold" and (falls := _lets_go(robot_config)):
         say(
             "Warning: this robot lets its motors go when it is disconnected, so the arm falls at the end of the run: "
-            "give --robot.disable_torque_on_disconnect=false to hold it."
+            f"give {' '.join(f'--robot.{name}=false' for name in falls)} to hold it."
         )
     return Operated(ArmEnvironment(arm, session, board, should_stop, clock), session, board)
+
+
+def _lets_go(config: Any, prefix: str = "") -> list[str]:
+    """Options, also of the arms that a robot is made of, by which motors go limp at the end."""
+    found = [f"{prefix}{LIMP}"] if getattr(config, LIMP, False) else []
+    parts = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    arms = {name: part for name, part in parts.items() if dataclasses.is_dataclass(part) and hasattr(part, LIMP)}
+    return found + [one for name, part in arms.items() for one in _lets_go(part, f"{prefix}{name}.")]
 
 
 @contextlib.contextmanager

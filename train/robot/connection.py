@@ -7,7 +7,13 @@ from lerobot.robots.robot import Robot
 
 from .readings import RobotFault
 
-__all__ = ["connect", "reconnect", "reconnect_cameras"]
+__all__ = ["connect", "motor_buses", "reconnect", "reconnect_cameras"]
+
+
+def motor_buses(robot: Robot) -> list[Any]:
+    """LeRobot's motor buses of a robot and of the robots that it is made of, such as two arms; may be none."""
+    parts = [robot, *(part for part in vars(robot).values() if isinstance(part, Robot))]
+    return [bus for part in parts if (bus := getattr(part, "bus", None)) is not None]
 
 
 def connect(robot: Robot) -> None:
@@ -25,7 +31,8 @@ def reconnect_cameras(robot: Robot) -> bool:
     Raises RobotFault where one does not answer.
     """
     gone = [camera for camera in _cameras(robot) if not camera.is_connected]
-    if not gone or not _connected(getattr(robot, "bus", None)):
+    buses = motor_buses(robot)
+    if not gone or not buses or not all(map(_connected, buses)):
         return False
     try:
         for camera in gone:
@@ -45,14 +52,14 @@ def reconnect(robot: Robot) -> None:
 
 def _disconnect(robot: Robot) -> None:
     """Close every part that is open, whatever fails, and leave the motors as they are: a limp arm falls."""
-    bus = getattr(robot, "bus", None)
-    if _connected(bus):
-        with contextlib.suppress(Exception):
-            bus.disconnect(disable_torque=False)  # type: ignore[union-attr]  # it is connected
-    # A transaction that the lost port broke off leaves the SDK's mark that it is still under way: for ever busy.
-    port: Any = getattr(bus, "port_handler", None)
-    if hasattr(port, "is_using"):
-        port.is_using = False
+    for bus in motor_buses(robot):
+        if _connected(bus):
+            with contextlib.suppress(Exception):
+                bus.disconnect(disable_torque=False)
+        # A transaction that the lost port broke off leaves the SDK's mark that it is still under way: for ever busy.
+        port: Any = getattr(bus, "port_handler", None)
+        if hasattr(port, "is_using"):
+            port.is_using = False
     for camera in _cameras(robot):
         with contextlib.suppress(Exception):
             camera.disconnect()

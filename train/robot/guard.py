@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lerobot_cqn.errors import CQNError
 
 from ..clock import REAL, Clock
-from .connection import connect, reconnect, reconnect_cameras
+from .connection import connect, motor_buses, reconnect, reconnect_cameras
 from .limits import Limits, allowed_goal
 from .readings import (
     Agreement,
@@ -308,15 +308,16 @@ class Guard:
     @property
     def can_release(self) -> bool:
         """Whether the robot's motors can be switched off and on, as LeRobot's motor buses can."""
-        bus = getattr(self.robot, "bus", None)
-        return callable(getattr(bus, "disable_torque", None)) and callable(getattr(bus, "enable_torque", None))
+        buses = motor_buses(self.robot)
+        switches = [getattr(bus, f"{verb}_torque", None) for bus in buses for verb in ("disable", "enable")]
+        return bool(switches) and all(map(callable, switches))
 
     def _torque(self, *, on: bool) -> None:
         if not self.can_release:
             raise RobotFault("This robot cannot be moved by hand: it has no motor bus that lets go.")
         try:
-            bus: Any = getattr(self.robot, "bus")  # noqa: B009  # not of every robot
-            (bus.enable_torque if on else bus.disable_torque)()
+            for bus in motor_buses(self.robot):
+                (bus.enable_torque if on else bus.disable_torque)()
         except Exception as error:  # drivers raise many kinds
             raise RobotFault(f"The motors cannot be switched {'on' if on else 'off'}: {error}") from error
 
