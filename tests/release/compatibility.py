@@ -28,6 +28,7 @@ from .build import SETTINGS, build, clean_copy
 from .document import read_section, write_section
 from .environments import Done, Environment, run
 from .lerobot_rows import SECTIONS
+from .robot_rows import PLUGINS
 from .rows import NOT, SHORT, Outcome, Row, Try, expand, judge_row, what_is_kept
 
 EXTRAS = ("core_scripts", "async", "hilserl", "peft", "kinematics")
@@ -172,9 +173,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with console.status("building and installing"):
             wheel = build(clean_copy(folder / "source"), "wheel", folder / "wheel")
             environment = Environment(folder)
-            wanted = f"{SETTINGS['project']['name']}[sim] @ {wheel.as_uri()}"
+            wanted = f"{SETTINGS['project']['name']}[sim,page] @ {wheel.as_uri()}"
             lerobot = f"lerobot[{','.join(EXTRAS)}]" + (f" @ {tree.as_uri()}" if tree else f"=={version('lerobot')}")
-            environment.make(sys.executable, [wanted, lerobot])
+            environment.make(sys.executable, [wanted, lerobot, *PLUGINS])
         write_zarr(folder / "small.zarr")
         bench = Bench(environment.place / "bin", environment.user, environment.variables)
         with console.status("preparing datasets"):

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from .dataset_rows import DATASETS, MACHINES
+from .robot_rows import ROBOTS
 from .rows import Row, Try, ends_well, evaluates, holds, reaches, says, writes
 
 PAIR = Path(__file__).parent / "inside/async_pair.py"
@@ -282,4 +283,5 @@ SECTIONS = {
     "Acting": USE,
     "Datasets": DATASETS,
     "Machines": MACHINES,
+    "Other people's robots": ROBOTS,
 }

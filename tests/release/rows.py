@@ -22,6 +22,7 @@ SHORT: Mapping[str, str] = {
     "ONE": "--eval.n_episodes=1 --eval.batch_size=1",
     "EDIT": "lerobot-edit-dataset --repo_id=local/clean --root=clean",
     "ARM": "--robot.type=sim_ur5e --robot.id=sim --robot.state=true --robot.camera_names=[]",
+    "HEX": "--robot.type=hex_arm_sim_follower --robot.headless=true --robot.id=hex",
     "LEADER": "--teleop.type=sim_leader --teleop.id=sim",
     "POLICY": "--policy.path=arm_offline/checkpoints/last/pretrained_model",
     "RL": "--policy.type=cqn --policy.discover_packages_path=lerobot_cqn --policy.push_to_hub=false "

@@ -19,7 +19,7 @@ STEP_S = 0.1  # of the pauses, whose lengths are in steps of it
 LOOK_S = 0.005  # real, between two movements of the hand
 SPEEDS = (0.75, 1.3)  # of a person, times the usual one
 AIM_M = 0.002  # standard deviation of where a person aims at
-TREMOR_STEPS, TREMOR_SHARE = 2.0, 0.1  # of the motor, and how much of it is new every 0.1 s
+TREMOR_STEPS, TREMOR_SHARE = 0.7, 0.1  # of the motor, and how much of it is new every 0.1 s
 HOLD_S = 0.4  # after the task is done
 
 
