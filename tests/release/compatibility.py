@@ -26,7 +26,7 @@ from ..foreign_formats import write_zarr
 from ..hub_server import HubServer
 from .build import SETTINGS, build, clean_copy
 from .document import read_section, write_section
-from .environments import Done, Environment, run
+from .environments import Done, Environment, run, uv
 from .lerobot_rows import SECTIONS
 from .robot_rows import PLUGINS
 from .rows import NOT, SHORT, Outcome, Row, Try, expand, judge_row, what_is_kept
@@ -131,8 +131,10 @@ class Bench:
         return outcome
 
 
-def page(outcomes: Mapping[str, Sequence[Outcome]]) -> list[str]:
-    """The generated part of docs/compatibility.md."""
+def page(outcomes: Mapping[str, Sequence[Outcome]], before: Sequence[str] = ()) -> list[str]:
+    """The generated part of docs/compatibility.md; before: lines of it, which rows without an outcome keep."""
+    lines_of = {_key(line): line for line in before if line.startswith("| `")}
+    lines_of |= {_key(line): line for found in outcomes.values() for one in found for line in [one.markdown()]}
     extras = ", ".join(f"`{name}`" for name in EXTRAS)
     lines = [
         f"LeRobot {version('lerobot')} with its extras {extras}, on a machine",
@@ -146,10 +148,16 @@ def page(outcomes: Mapping[str, Sequence[Outcome]]) -> list[str]:
         *(f"{name}={json.dumps(options) if ' ' in options else options}" for name, options in SHORT.items()),
         "```",
     ]
-    for title, found in outcomes.items():
+    for title, rows in SECTIONS.items():
         lines += ["", f"## {title}", "", "| command | verdict | what was run | |", "|---|---|---|---|"]
-        lines += [outcome.markdown() for outcome in found]
+        ways = [[Outcome(row, "", one.shown or one.line, "").markdown() for one in row.tries] for row in rows]
+        lines += [lines_of[_key(way)] for ways_of_row in ways for way in ways_of_row if _key(way) in lines_of]
     return lines
+
+
+def _key(line: str) -> str:
+    """What was run, by a row of the page's table."""
+    return line.split(" | ", 3)[2]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -175,7 +183,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             environment = Environment(folder)
             wanted = f"{SETTINGS['project']['name']}[sim,page] @ {wheel.as_uri()}"
             lerobot = f"lerobot[{','.join(EXTRAS)}]" + (f" @ {tree.as_uri()}" if tree else f"=={version('lerobot')}")
-            environment.make(sys.executable, [wanted, lerobot, *PLUGINS])
+            environment.make(sys.executable, [wanted, lerobot])
+            # Afterwards, as a user does: together with all of LeRobot's extras they have no solution.
+            uv("pip", "install", "--quiet", "--python", str(environment.python), *PLUGINS)
         write_zarr(folder / "small.zarr")
         bench = Bench(environment.place / "bin", environment.user, environment.variables)
         with console.status("preparing datasets"):
@@ -203,11 +213,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         found = differences(outcomes, forgotten(tree))
         console.print("\n".join(["", *found]) if found else "\nas the page says", markup=False)
         return int(bool(found))
-    lines = page(outcomes)
-    if options.only:
-        new = {line.rpartition(" | ")[0].split(" | ", 2)[-1]: line for line in lines if line.startswith("| `")}
-        lines = [new.get(line.rpartition(" | ")[0].split(" | ", 2)[-1], line) for line in read_section("commands")]
-    write_section("commands", lines)
+    write_section("commands", page(outcomes, read_section("commands") if options.only else ()))
     return 0
 
 

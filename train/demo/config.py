@@ -46,10 +46,10 @@ class So101DemoConfig:
     spread_m: float = 0.01  # things lie within so far of the middle: the policy sees joints only
     demonstrations: int = 20
     pause_share: float = 0.3
-    offline_updates: int = 60
-    steps: int = 2000
+    offline_updates: int = 300
+    steps: int = 1600
     eval_episodes: int = 20
-    episode_s: float = 7.0  # simulated
+    episode_s: float = 8.0  # simulated
     speed: float = 2.0  # simulated seconds in a real one
     fps: int = 20  # control steps in a real second: 10 in a simulated one
     cameras: int = 0  # port of two cameras that the policy sees as well; 0: it sees joints only
