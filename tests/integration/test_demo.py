@@ -6,9 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from rich.console import Console
 
-from cqn_train.demo.stages import Stages
+from cqn_train.demo.so101 import LateAnswerError, _patiently, _spoken
+from cqn_train.demo.stages import DemoError, Stages
+from cqn_train.sim_arm.keyboard import Terminal
 
 TINY = (
     "--demonstrations=3", "--offline_updates=4", "--steps=30", "--eval_freq=0", "--eval_episodes=1",
@@ -68,3 +71,38 @@ def test_demo_names_the_command_that_failed(tmp_path: Path) -> None:
     assert result.returncode == 2
     assert result.stderr.startswith("demo: error: 'record' failed")
     assert "Traceback" not in result.stdout + result.stderr
+
+
+def test_only_a_late_answer_of_a_motor_is_tried_again(tmp_path: Path) -> None:
+    """What a busy machine does to LeRobot's drivers is no failure of the demo; anything else is."""
+    stages, begun = Stages(tmp_path, Console(quiet=True)), []
+
+    def ends_with(*errors: Exception) -> None:
+        begun.clear()
+
+        def attempt() -> None:
+            begun.append(len(begun))
+            if len(begun) <= len(errors):
+                raise errors[len(begun) - 1]
+
+        _patiently(stages, attempt)
+
+    ends_with(LateAnswerError("late"), LateAnswerError("late"))
+    assert len(begun) == 3
+    with pytest.raises(LateAnswerError):
+        ends_with(*[LateAnswerError("late")] * 3)
+    with pytest.raises(DemoError, match="broken"):
+        ends_with(DemoError("broken"))
+    assert len(begun) == 1
+
+
+def test_a_command_that_ends_says_why(tmp_path: Path) -> None:
+    stages = Stages(tmp_path, Console(quiet=True))
+    late = "import sys; print('There is no status packet!'); print('and more'); sys.exit(1)"
+    for script, kind in ((late, LateAnswerError), ("print('no such port'); raise SystemExit(3)", DemoError)):
+        command = Terminal([sys.executable, "-c", script])
+        with pytest.raises(DemoError) as raised, _spoken(stages, "talk", command):
+            command.hears("what it never says")
+        assert type(raised.value) is kind
+    assert "no such port" in str(raised.value)
+    assert "no such port" in (stages.logs / "talk.log").read_text()

@@ -183,7 +183,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             environment = Environment(folder)
             wanted = f"{SETTINGS['project']['name']}[sim,page] @ {wheel.as_uri()}"
             lerobot = f"lerobot[{','.join(EXTRAS)}]" + (f" @ {tree.as_uri()}" if tree else f"=={version('lerobot')}")
-            environment.make(sys.executable, [wanted, lerobot])
+            environment.make(sys.executable, [wanted, lerobot], "--no-sources")  # a tree may name indices of its own
             # Afterwards, as a user does: together with all of LeRobot's extras they have no solution.
             uv("pip", "install", "--quiet", "--python", str(environment.python), *PLUGINS)
         write_zarr(folder / "small.zarr")

@@ -12,6 +12,7 @@ from ..virtual_so101.table import Table
 __all__ = ["Film"]
 
 FPS = 8  # of the real clock
+MOVES = 0.05  # mean difference of two pictures, of 255, beyond which something moves; what stands still is cut
 SIZE = (240, 320)  # height, width in pixels
 
 
@@ -24,6 +25,7 @@ class Film:
 
     def __init__(self, table: Table) -> None:
         self._table = table
+        table.picture("side", *SIZE)  # the first one takes long, in which no motor would answer
         self.frames: list[NDArray[np.uint8]] = []
 
     @contextmanager
@@ -40,4 +42,6 @@ class Film:
 
     def _roll(self, cut: threading.Event) -> None:
         while not cut.wait(1 / FPS):
-            self.frames.append(self._table.picture("side", *SIZE))
+            picture = self._table.picture("side", *SIZE)
+            if not self.frames or np.abs(picture.astype(int) - self.frames[-1]).mean() > MOVES:
+                self.frames.append(picture)

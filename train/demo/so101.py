@@ -32,7 +32,12 @@ from .stages import DemoError, Stages, Watched, fresh, run_once
 __all__ = ["main", "run_demo"]
 
 ARMS = {"follower": ("robot", "so101_follower"), "leader": ("teleop", "so101_leader")}
+LATE = "There is no status packet"  # as the motors' SDK says it
 AGAIN = b"r"  # lerobot-record's key: the episode once more
+
+
+class LateAnswerError(DemoError):
+    """A motor's answer came after the time for which LeRobot's driver waits."""
 
 
 def run_demo(config: So101DemoConfig, console: Console) -> dict[str, Any]:
@@ -104,6 +109,8 @@ def _spoken(stages: Stages, name: str, command: Terminal, seconds: float = 60.0)
         raise
     finally:
         (stages.logs / f"{name}.log").write_text(command.said)
+    if code and LATE in command.said:
+        raise LateAnswerError(f"'{name}': {LATE}; all of it in {stages.logs / f'{name}.log'}")
     stages.check(name, code)
 
 
@@ -113,8 +120,8 @@ def _patiently(stages: Stages, attempt: Callable[[], None]) -> None:
         try:
             attempt()
             return
-        except DemoError as error:
-            if not left or "no status packet" not in str(error):
+        except LateAnswerError:
+            if not left:
                 raise
             stages.console.print("  an answer came too late for LeRobot's driver: once more")
 

@@ -55,6 +55,8 @@ class CameraServer:
         except self._zmq.ZMQError as error:
             self._close()
             raise ConfigError(f"Port {self._port} is taken: give another for the cameras.") from error
+        for name in self._names:
+            self._table.picture(name, *self._size)  # the first ones take long, in which no motor would answer
         self._thread.start()
         return self
 

@@ -192,7 +192,7 @@ def _scene(mujoco: Any, task: TableTask) -> Any:
     world.add_geom(name="wall", type=box, size=[0.02, 3.0, 1.5], pos=[-0.8, 0.2, 0.5], rgba=[0.62, 0.7, 0.76, 1.0])
     world.add_light(pos=[0.3, -0.3, 1.2], dir=[0.0, 0.3, -1.0], diffuse=[0.5, 0.5, 0.5], castshadow=False)
     _camera(world, "front", [0.62, -0.12, 0.32], [0.2, 0.02, 0.05], 45.0)
-    _camera(world, "side", [0.78, -0.1, 0.42], [0.1, 0.2, 0.1], 40.0)
+    _camera(world, "side", [0.7, 0.0, 0.36], [0.12, 0.21, 0.1], 42.0)
     spec.body("gripper").add_camera(name="wrist", pos=[0.0, 0.07, 0.0], xyaxes=[1.0, 0, 0, 0, 0.82, -0.57], fovy=75.0)
     task.build(mujoco, spec)
     spec.visual.quality.offsamples, spec.visual.quality.shadowsize = 4, 0
