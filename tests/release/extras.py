@@ -142,6 +142,7 @@ PROBES: dict[str, Extra] = {
     "aloha": _stepping("aloha_small", "transfer_cube"),
     "dmc": _stepping("dmc", "cartpole-swingup"),
     "so101": _recording("so101_sim", "pick_place"),
+    "virtual": Extra(_script("virtual.py"), lambda inputs: ("cqn-virtual-so101", "--task=press_button")),
     "gyms": Extra(_gyms, None, "each environment names its own extra"),
     "bench": Extra(_script("bench.py"), _missing_script("bench.py")),
     "page": Extra(_script("page.py"), _missing_script("page.py")),

@@ -104,7 +104,7 @@ TRAIN = (
             Try(
                 "torchrun --nproc_per_node=2 -m lerobot.scripts.lerobot_train $CQN $RUN $DATA --steps=3 "
                 "--output_dir=two",
-                says("batch size: 4 x 2 = 8"),
+                says(r"batch size: 4 x 2\b"),
             ),
         ),
         {"": "Two processes on a CPU; several GPUs were not tried."},

@@ -47,7 +47,7 @@ class So101DemoConfig:
     demonstrations: int = 20
     pause_share: float = 0.3
     offline_updates: int = 300
-    steps: int = 1600
+    steps: int = 2400
     eval_episodes: int = 20
     episode_s: float = 8.0  # simulated
     speed: float = 2.0  # simulated seconds in a real one
