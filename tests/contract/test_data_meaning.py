@@ -261,7 +261,9 @@ def test_a_leap_to_the_leader_is_said_and_cut_and_widens_no_bounds(tmp_path):
     for name, leap in {"leap": 5, "none": 0}.items():
         root = write_columns(tmp_path / name, [episode(s, leap if s == 1 else 0) for s in range(4)])
         assert ("leaps" in inspect(root)) == bool(leap)
-        assert main(["run", "arm_state", *options, f"--root={root}", f"--new_root={tmp_path / name}_clean"]) == 0
+        trimmed = tmp_path / f"{name}_trimmed"
+        assert main(["trim", "--leap", options[0], f"--root={root}", f"--new_root={trimmed}"]) == 0
+        assert main(["run", "arm_state", *options, f"--root={trimmed}", f"--new_root={tmp_path / name}_clean"]) == 0
         actions = column(tmp_path / f"{name}_clean", ACTION)[:, :3]
         widths[name] = np.ptp(actions, axis=0)
     np.testing.assert_allclose(widths["leap"], widths["none"], rtol=0.2)

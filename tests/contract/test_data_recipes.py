@@ -81,7 +81,7 @@ def test_shipped_recipe_by_name_with_a_changed_setting(recording, tmp_path, caps
     out = capsys.readouterr().out
     assert "32x32" in out
     assert "Dry run: nothing was written." in out
-    run("run", recording, tmp_path / "dst", "--resample.fps=1", code=2, recipe=["paper_real_world"])
+    run("run", recording, tmp_path / "dst", "--trim.head=1", code=2, recipe=["paper_real_world"])
     assert "Unknown step of paper_real_world" in last_line(capsys)
     run("run", recording, tmp_path / "dst", code=2, recipe=["papr_real_world"])
     assert "Did you mean 'paper_real_world'?" in last_line(capsys)

@@ -154,7 +154,7 @@ def _set_up(stages: Stages, bench: Bench, arm: str) -> None:
 
 def _demonstrations(stages: Stages, config: So101DemoConfig, bench: Bench, film: Film) -> Path:
     """Record demonstrations with the leader, and clean them; returns the folder of the cleaned ones."""
-    raw, clean = (config.output_dir / "data" / name for name in ("raw", "clean"))
+    raw, trimmed, clean = (config.output_dir / "data" / name for name in ("raw", "trimmed", "clean"))
     finished = stages.logs / "record.done"
     if not finished.exists():
         with stages.console.status(f"  lerobot-record: {config.demonstrations} demonstrations"):
@@ -163,8 +163,12 @@ def _demonstrations(stages: Stages, config: So101DemoConfig, bench: Bench, film:
         stages.console.print(f"  lerobot-record: {config.demonstrations} demonstrations")
     recipe = "paper_real_world" if config.cameras else "arm_state"
     stages.run(
+        "trim", "cqn-data: the leap to the leader off", trimmed, "cqn_data.cli", "trim", "--leap",
+        "--repo_id=demo/raw", f"--root={raw}", "--new_repo_id=demo/trimmed", f"--new_root={trimmed}",
+    )  # fmt: skip
+    stages.run(
         "recipe", "cqn-data: pauses out, joint differences, bounds", clean, "cqn_data.cli", "run", recipe,
-        "--repo_id=demo/raw", f"--root={raw}", "--new_repo_id=demo/clean", f"--new_root={clean}",
+        "--repo_id=demo/trimmed", f"--root={trimmed}", "--new_repo_id=demo/clean", f"--new_root={clean}",
     )  # fmt: skip
     return clean
 
