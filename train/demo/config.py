@@ -49,7 +49,7 @@ class So101DemoConfig:
     offline_updates: int = 300
     steps: int = 2400
     eval_episodes: int = 20
-    episode_s: float = 12.0  # simulated
+    episode_s: float = 8.0  # simulated
     speed: float = 2.0  # simulated seconds in a real one
     fps: int = 20  # control steps in a real second: 10 in a simulated one
     cameras: int = 0  # port of two cameras that the policy sees as well; 0: it sees joints only
