@@ -42,12 +42,12 @@ def leader(bench: Bench, folder: Path) -> SO101Leader:
 @pytest.mark.parametrize("task", ["press_button", "cube_in_bowl"])
 def test_what_the_leader_shows_the_follower_does(tmp_path: Path, task: str) -> None:
     """A demonstration through both of LeRobot's drivers, as lerobot-teleoperate passes it on."""
-    with Bench.on(BenchConfig(links=BOTH, task=task, speed=2.0, pause_share=0.2)) as bench:
+    with Bench.on(BenchConfig(links=BOTH, task=task, pause_share=0.2)) as bench:
         table, demonstrator = bench.at_table()
         for folder in (tmp_path / "leader", tmp_path / "follower"):
             folder.mkdir()
         lead, follow = leader(bench, tmp_path / "leader"), calibrated(bench.ports["follower"], tmp_path / "follower")
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 150
 
         def mirror(until: Callable[[], bool]) -> None:
             while not until():
@@ -62,9 +62,14 @@ def test_what_the_leader_shows_the_follower_does(tmp_path: Path, task: str) -> N
 
         mirror(led(demonstrator.home))
         mirror(lambda: not table.away)  # which lays a scene out
-        scene = table.scenes
-        mirror(led(demonstrator.show))
-        assert table.success
+        for _ in range(5):  # a person fails now and then, and more often on a busy machine
+            scene = table.scenes
+            mirror(led(demonstrator.show))
+            if done := table.success:
+                break
+            mirror(led(demonstrator.home))
+            table.lay_out()
+        assert done
         mirror(led(demonstrator.home))
         mirror(lambda: table.scenes > scene)
         lead.disconnect()
