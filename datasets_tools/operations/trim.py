@@ -67,7 +67,8 @@ carries a reward or an end is only cut off with --cut_rewards.
                 raise ConfigError(f"Expected --cuts of [start, end], both >= 0, for episode {index}, got {cut}.")
         if self.min_steps < 1:
             raise ConfigError(f"Expected --min_steps >= 1, got {self.min_steps}.")
-        if self == Trim(min_steps=self.min_steps):
+        asked = (self.head, self.tail, self.head_seconds, self.tail_seconds, self.motion, self.after_success, self.cuts)
+        if not any((*asked, self.leap)):
             raise ConfigError(
                 "Nothing to trim: give --head, --tail, their seconds, --cuts, --leap, --motion or --after_success."
             )

@@ -26,12 +26,21 @@ from cqn_train.arm.build import _lets_go, check_commands
 from cqn_train.robot.connection import motor_buses
 from cqn_train.robot.guard import Guard, GuardSettings
 from cqn_train.robot.limits import Limits
-from cqn_train.robot.readings import RobotFault
 from cqn_train.virtual_so101.arm import assembled, hand_wave
 from cqn_train.virtual_so101.port import VirtualPort
 
 from .conftest import TINY_POLICY
-from .test_virtual_so101 import DEGREES, SPAN_DEG, STEP_DEG, Watched, calibrated, drive, drives_well, hurried
+from .test_virtual_so101 import (
+    DEGREES,
+    SPAN_DEG,
+    STEP_DEG,
+    Watched,
+    calibrated,
+    drive,
+    drives_well,
+    hurried,
+    taken_up_again,
+)
 
 pytestmark = pytest.mark.real_time(reason="serial ports, and motors that move in the machine's own time")
 
@@ -83,14 +92,7 @@ def test_one_arms_cable_is_a_fault_of_both_and_both_are_taken_up_again(guarded: 
     assert [servo.goal for servo in ports["right"].chain.servos] == held  # whose wire is whole: nothing more comes
     assert all(servo.torque for servo in ports["right"].chain.servos)
     ports["left"].plug()
-    deadline = time.monotonic() + 20
-    while True:
-        try:
-            guard.recover()
-            break
-        except RobotFault:
-            assert time.monotonic() < deadline, "they are not taken up again"
-            time.sleep(0.2)
+    taken_up_again(guard)
     drives_well(guard)
     assert max(leap for each in watched for leap in each.leaps) <= STEP_DEG + 3 * DEGREES
 

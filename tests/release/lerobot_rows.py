@@ -104,7 +104,7 @@ TRAIN = (
             Try(
                 "torchrun --nproc_per_node=2 -m lerobot.scripts.lerobot_train $CQN $RUN $DATA --steps=3 "
                 "--output_dir=two",
-                says(r"batch size: 4 x 2\b"),
+                says(r"batch size: 4 x 2 (= 8|dp workers)"),
             ),
         ),
         {"": "Two processes on a CPU; several GPUs were not tried."},

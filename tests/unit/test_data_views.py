@@ -261,6 +261,12 @@ def test_trim_after_success_keeps_the_success_and_never_cuts_a_reward(three):
         Trim().validate()
 
 
+@pytest.mark.parametrize("alone", [{"keep_still": 3}, {"auto": True}, {"threshold": 0.1}, {"cut_rewards": True}])
+def test_settings_that_cut_nothing_by_themselves_are_refused(alone):
+    with pytest.raises(ConfigError, match="Nothing to trim"):
+        Trim(**alone).validate()
+
+
 @pytest.mark.parametrize(("keep", "expected"), [(0, (5, 13)), (2, (3, 15)), (50, (0, 20))])
 def test_trim_by_motion_leaves_the_still_steps_asked_for(keep, expected):
     state = np.zeros((20, 3))

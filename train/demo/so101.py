@@ -19,7 +19,7 @@ from rich.console import Console
 
 from ..interfaces import PAGE_TOKEN
 from ..run.metrics import read_rows
-from ..sim_arm.keyboard import NEXT, Terminal
+from ..sim_arm.keyboard import NEXT, Terminal, own_program
 from ..sim_arm.person import SimPerson
 from ..virtual_so101.arm import hand_sweep
 from ..virtual_so101.bench import SERVED, Bench, BenchConfig
@@ -89,8 +89,7 @@ def _both(bench: Bench, config: So101DemoConfig) -> list[str]:
 
 
 def _command(stages: Stages, name: str, *arguments: str) -> Terminal:
-    own = Path(sys.executable).parent / name  # beside this Python, whether or not its folder is on the path
-    return Terminal([str(own) if own.is_file() else name, *arguments], environment=stages.environment)
+    return Terminal([own_program(name), *arguments], environment=stages.environment)
 
 
 @contextmanager

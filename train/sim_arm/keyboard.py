@@ -14,7 +14,7 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-__all__ = ["NEXT", "RECORD_KEYS", "Terminal"]
+__all__ = ["NEXT", "RECORD_KEYS", "Terminal", "own_program"]
 
 LOOK_S = 0.02  # between two looks at what it has said
 NEXT = b"n"  # lerobot-record's key in a terminal: the episode, or the reset, is over
@@ -98,11 +98,16 @@ class Terminal:
         os.close(self._master)
 
 
+def own_program(name: str) -> str:
+    """A command beside this Python, whether or not its folder is on the path; else its name."""
+    own = Path(sys.executable).parent / name
+    return str(own) if own.is_file() else name
+
+
 def main(arguments: Sequence[str]) -> int:
     """Run lerobot-record with its arguments and press its keys; returns its exit code."""
     name, *rest = arguments
-    own = Path(sys.executable).parent / name  # beside this Python, whether or not its folder is on the path
-    terminal = Terminal([str(own) if own.is_file() else name, *rest])
+    terminal = Terminal([own_program(name), *rest])
     try:
         return terminal.run(RECORD_KEYS, 3600.0)
     finally:

