@@ -95,6 +95,10 @@ class DrQv2Model(Model):
         self.target_critic.load_state_dict(self.critic.state_dict())
         self.target_critic.requires_grad_(False)
 
+    def acting(self) -> Sequence[str]:
+        """Encoders, actor, and the critic that says what its action is worth."""
+        return "encoders", "actor", "critic"
+
     def averaged(self) -> Sequence[tuple[nn.Module, nn.Module]]:
         """The target critic follows the critic; DrQ-v2 has no target actor and no target encoder."""
         return [(self.target_critic, self.critic)]

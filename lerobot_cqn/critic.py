@@ -55,6 +55,10 @@ class CQNModel(Model):
         self.target_critic.load_state_dict(self.critic.state_dict())
         self.target_critic.requires_grad_(False)
 
+    def acting(self) -> Sequence[str]:
+        """Encoders and the critic that `act_with` names."""
+        return "encoders", "target_critic" if self.settings.act_with == "target" else "critic"
+
     def averaged(self) -> Sequence[tuple[nn.Module, nn.Module]]:
         """The target critic follows the critic; the reference has no target encoder."""
         return [(self.target_critic, self.critic)]

@@ -61,6 +61,10 @@ class Model(nn.Module):
         """Loss and its parts (detached scalars) for an already augmented batch."""
         raise NotImplementedError
 
+    def acting(self) -> Sequence[str]:
+        """Names of the networks that `act` asks."""
+        raise NotImplementedError
+
     def averaged(self) -> Sequence[tuple[nn.Module, nn.Module]]:
         """Pairs of a target network and the online network that it follows."""
         raise NotImplementedError

@@ -22,7 +22,7 @@ from lerobot_cqn import configuration_cqn, configuration_cqn_as, configuration_d
 from lerobot_cqn.errors import ConfigError
 
 from .arm.devices import register_devices
-from .config import DatasetSettings, EvalSettings, PageSettings, ReplaySettings, RunConfig, WandBSettings
+from .config import DatasetSettings, EvalSettings, PageSettings, RaySettings, ReplaySettings, RunConfig, WandBSettings
 from .robot.settings import ArmSettings
 from .run.checkpoint import last_checkpoint
 
@@ -180,7 +180,7 @@ def _options(arguments: Sequence[str]) -> list[str]:
     """Every option there is for the chosen environment."""
     groups: dict[str, type] = {
         "": RunConfig, "dataset.": DatasetSettings, "eval.": EvalSettings, "wandb.": WandBSettings,
-        "replay.": ReplaySettings, "arm.": ArmSettings, "page.": PageSettings,
+        "replay.": ReplaySettings, "arm.": ArmSettings, "page.": PageSettings, "ray.": RaySettings,
     }  # fmt: skip
     policy = parser.parse_arg("policy.type", list(arguments)) or "cqn"
     if policy in PreTrainedConfig.get_known_choices():

@@ -15,6 +15,7 @@ from lerobot.policies.factory import get_policy_class, make_policy, make_pre_pos
 from lerobot.robots.config import RobotConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
 
+from lerobot_cqn.base_config import RLConfig
 from lerobot_cqn.delta_actions import origin_of, recorded_deltas
 from lerobot_cqn.errors import ConfigError, OutputExistsError
 from lerobot_cqn.joint_goals import converted_deltas
@@ -26,7 +27,8 @@ from .agent import Agent
 from .arm.build import make_operated, recall, steering
 from .clock import REAL, Clock
 from .config import ValidRun
-from .interfaces import Environment, Monitor, Nobody, Person, Scenes
+from .interfaces import Monitor, Scenes
+from .loop.experience import Experience, Here
 from .loop.gym_env import GymEnvironment, GymScenes, OneScene, check_fits
 from .loop.trainer import Trainer
 from .operator.board import Board
@@ -41,22 +43,24 @@ from .run.first_look import draw_batch, warnings_about
 from .run.metrics import Log, Metrics, start_tensorboard, start_wandb
 from .run.progress import Monitors
 
-__all__ = ["build"]
+__all__ = ["MakeWorld", "World", "build", "make_agent", "trained_agent"]
 
 Bounds = Mapping[str, Any]
+MakeWorld = Callable[
+    [ValidRun, Path | None, Demonstrations | None, Callable[[str], None], Callable[[], bool], contextlib.ExitStack],
+    "World",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """Environment to learn and to evaluate in, and the person beside it.
+    """Policy, and where its episodes come from.
 
     bounds: `min` and `max` [D] of the environment's action, None where it has none; board: what the person is shown.
     """
 
-    env: Environment
-    scenes: Scenes
     agent: Agent
-    person: Person
+    experience: Experience
     bounds: Bounds | None = None
     board: Board | None = None
 
@@ -67,10 +71,12 @@ def build(
     should_stop: Callable[[], bool],
     stack: contextlib.ExitStack,
     clock: Clock = REAL,
+    make_world: "MakeWorld | None" = None,
 ) -> Trainer:
     """Every part of a run, put together. Raises CQNError before any work is done.
 
-    stack: takes up what must be closed again; clock: by which trainer and arm live.
+    stack: takes up what must be closed again; clock: by which trainer and arm live; make_world: makes policy and
+    source of episodes, None: in this process.
     """
     config = run.config
     check_outside(run, monitor.message)
@@ -79,7 +85,9 @@ def build(
         torch.set_num_threads(config.threads)
     rng = seed_everything(config.seed)
     data = Demonstrations(config.dataset) if config.dataset.repo_id else None
-    if isinstance(run.acts_in, EnvConfig):
+    if make_world is not None:
+        world = make_world(run, checkpoint, data, monitor.message, should_stop, stack)
+    elif isinstance(run.acts_in, EnvConfig):
         world = make_simulation(run.acts_in, run, checkpoint, data, stack)
     else:
         world = make_arm(run.acts_in, run, checkpoint, data, monitor.message, should_stop, stack, clock)
@@ -104,7 +112,8 @@ def build(
     if checkpoint is not None:
         counters, tables = restore(checkpoint, learner, rng)
         metrics.truncate(tables)
-        finished = [place for place in finished if place.number >= counters.episodes]
+        held = stored_episodes(checkpoint) or frozenset(range(counters.episodes))  # an older one does not say
+        finished = [place for place in finished if place.number not in held]
         monitor.message(f"Resuming at step {counters.env_steps}, {counters.updates} updates.")
 
     def save_checkpoint() -> None:
@@ -120,9 +129,9 @@ def build(
         recall(world.board, run.output_dir)
         monitor = Monitors([monitor, world.board])
     return Trainer(
-        config=config, agent=agent, learner=learner, env=world.env, scenes=world.scenes, replay=replay,
-        metrics=metrics, monitor=monitor, rng=rng, counters=counters, save=save_checkpoint, should_stop=should_stop,
-        finished_since=finished, person=world.person, spare=spare, clock=clock,
+        config=config, agent=agent, learner=learner, experience=world.experience, replay=replay, metrics=metrics,
+        monitor=monitor, rng=rng, counters=counters, save=save_checkpoint, should_stop=should_stop,
+        finished_since=finished, spare=spare, clock=clock,
     )  # fmt: skip
 
 
@@ -161,7 +170,8 @@ def make_simulation(
         scenes = GymScenes(env_config, run.policy, evaluation.batch_size, apart=evaluation.use_async_envs)
     stack.callback(gym.close)
     stack.callback(scenes.close)
-    return World(env=gym, scenes=scenes, agent=agent, person=Nobody(), bounds=bounds)
+    here = Here.alone(gym, scenes, run.config.recipe.random_steps)
+    return World(agent=agent, experience=here, bounds=bounds)
 
 
 def make_arm(
@@ -176,12 +186,13 @@ def make_arm(
 ) -> World:
     """An arm with its person at the page or at keys; it is the only scene of evaluations, too."""
     agent = make_agent(run, checkpoint, data, None)
-    operated = make_operated(robot_config, run.config, agent, data, should_stop, say, clock)
+    recorded = data.recorded() if data is not None else None
+    operated = make_operated(robot_config, run.config, agent, recorded, should_stop, say, clock)
     stack.enter_context(steering(run.config, operated, say))  # before anything is written: the port may be taken
     stack.callback(operated.env.close)
     stack.callback(lambda: say(operated.env.summary()) if operated.env.summary() else None)
-    scenes = OneScene(operated.env)
-    return World(env=operated.env, scenes=scenes, agent=agent, person=operated.session, board=operated.board)
+    here = Here(env=operated.env, scenes=OneScene(operated.env), person=operated.session)
+    return World(agent=agent, experience=here, board=operated.board)
 
 
 # -- the policy ----------------------------------------------------------------------------------------------
@@ -193,21 +204,22 @@ def make_agent(run: ValidRun, checkpoint: Path | None, data: Demonstrations | No
     Without a dataset the features are the environment's and the state stays as it is.
     """
     pretrained = checkpoint / "pretrained_model" if checkpoint is not None else run.policy.pretrained_path
-    agent = trained_agent(run, Path(pretrained)) if pretrained is not None else new_agent(run, data, env_bounds)
+    trained = trained_agent(run.policy, Path(pretrained)) if pretrained is not None else None
+    agent = trained or new_agent(run, data, env_bounds)
     agent.policy.train()
     return agent
 
 
-def trained_agent(run: ValidRun, folder: Path) -> Agent:
+def trained_agent(config: RLConfig, folder: Path) -> Agent:
     """The policy in a folder. Raises ConfigError where its weights do not fit the settings."""
     try:
-        policy: Any = get_policy_class(run.policy.type).from_pretrained(folder, config=run.policy)
+        policy: Any = get_policy_class(config.type).from_pretrained(folder, config=config)
     except RuntimeError as error:  # torch names every tensor that differs
         raise ConfigError(
             f"The weights in {folder} do not fit: leave out the --policy.* settings that change the network "
             "(sizes, levels, bins, atoms, frame_stack), or start anew."
         ) from error
-    return Agent(policy, *make_pre_post_processors(run.policy, pretrained_path=str(folder)))
+    return Agent(policy, *make_pre_post_processors(config, pretrained_path=str(folder)))
 
 
 def new_agent(run: ValidRun, data: Demonstrations | None, env_bounds: Bounds | None) -> Agent:

@@ -1,6 +1,5 @@
 """`cqn-train`: read the command line, build the run, train; errors become one line and an exit code."""
 
-import contextlib
 import logging
 import os
 import sys
@@ -17,7 +16,6 @@ from . import envs  # noqa: F401  # registers our environments
 from .arguments import introduction, parse
 from .arm.devices import register_devices
 from .config import RunConfig, ValidRun
-from .interfaces import Interrupted
 from .run.blame import plugin_at_fault
 from .run.progress import ConsoleMonitor
 from .run.stop import StopRequest
@@ -38,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.print_scoped_help(RunConfig, arguments)
         return 0
     try:
-        return run(parse(arguments).validate())
+        return run(parse(arguments).validate(), arguments)
     except KeyboardInterrupt as error:  # of a push it says what is on the Hub
         print(f"cqn-train: {error or 'stopped at once; the last checkpoint is untouched.'}", file=sys.stderr)  # noqa: T201
         return 130
@@ -56,45 +54,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise
 
 
-def run(valid: ValidRun) -> int:
-    """Build and train; 0 when complete, 130 when stopped on request with a checkpoint saved."""
-    from .build import build  # LeRobot's policies, datasets and simulators: seconds that --help need not take
+def run(valid: ValidRun, arguments: Sequence[str] = ()) -> int:
+    """Train; 0 when complete, 130 when stopped on request with a checkpoint saved.
 
-    with ConsoleMonitor() as monitor, StopRequest() as should_stop, contextlib.ExitStack() as stack:
-        trainer = build(valid, monitor, should_stop, stack)
-        again = f"Continue with: cqn-train --resume=true --output_dir={valid.output_dir}"
-        try:
-            trainer.run()
-        except Interrupted:
-            trainer.save()
-            monitor.message(f"Stopped. {again}")
-            return 130
-        except OSError:  # of the machine (no descriptors left, a device gone): what was learned is sound
-            if (
-                trainer.counters.updates or trainer.counters.episodes
-            ):  # else nothing is learned, and the same command begins again
-                with contextlib.suppress(OSError):
-                    trainer.save()
-                    monitor.message(f"Saved. {again}")
-            raise
-        monitor.message(f"Policy: {valid.output_dir}/checkpoints/last/pretrained_model")
-        from .run.judgement import practice, read_tables
-        from .run.report import write_report
+    arguments: of the command line, for those processes of the run that are not this one.
+    """
+    with ConsoleMonitor() as monitor, StopRequest() as should_stop:
+        if valid.config.ray.actors:
+            from .cluster.launch import launch
 
-        if report := write_report(valid.output_dir):
-            monitor.message(f"{practice(read_tables(valid.output_dir))}\nReport: {report}")
-    policy = valid.policy
-    if policy.push_to_hub:
-        from .push.config import PushConfig
-        from .push.send import push
+            return launch(valid, arguments, monitor, should_stop)
+        from .execute import execute  # LeRobot's policies, datasets and simulators: seconds that --help need not take
 
-        push(
-            PushConfig(
-                run=str(valid.output_dir), repo_id=str(policy.repo_id), private=bool(policy.private),
-                license=policy.license, tags=list(policy.tags or ()),
-            )
-        )  # fmt: skip
-    return 0
+        return execute(valid, monitor, should_stop)
 
 
 def set_up_logging(debug: bool) -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
@@ -19,6 +20,7 @@ __all__ = [
     "DatasetSettings",
     "EvalSettings",
     "PageSettings",
+    "RaySettings",
     "Recipe",
     "ReplaySettings",
     "RunConfig",
@@ -123,6 +125,37 @@ class PageSettings:
 
 
 @dataclass
+class RaySettings:
+    """Acting in other processes, on this machine or on others, by Ray (docs/scale.md)."""
+
+    # collectors, each with an environment or an arm of its own, beside the process that learns; 0: all in one process
+    actors: int = number(0, least=0, most=1024)
+    # of a cluster that runs, as HOST:PORT or "auto"; None: one that lives on this machine while the run does
+    address: str | None = None
+    robot_resource: str = ""  # of the cluster's nodes; each collector takes one, so that it is where its arm is
+    # settings of single collectors on top, e.g. [{robot.port: /dev/ttyACM0}, {robot.port: /dev/ttyACM2}]
+    each: list[dict[str, Any]] = field(default_factory=list)
+    # updates that may still be owed when an episode begins; 0: none, so that it begins with what all before it taught
+    max_staleness: int = number(200, least=0)
+    device: str = "cpu"  # that collectors choose actions on
+    # join a cluster whose ports other machines reach although it asks for no token: whoever reaches them controls it
+    open_network: bool = False
+
+    def validate(self, beside: int) -> None:
+        """Raises ConfigError for values out of range, or where some have no effect. beside: `async_updates`."""
+        check_ranges(self, "ray.")
+        if self.actors and beside:
+            raise ConfigError("With collectors learning goes on beside acting: leave out --async_updates.")
+        if not self.actors and self != RaySettings():
+            raise ConfigError("--ray.… has no effect without collectors: give --ray.actors=N, or leave it out.")
+        if len(self.each) > self.actors:
+            raise ConfigError(
+                f"--ray.each has {len(self.each)} entries for --ray.actors={self.actors}: expected one a collector, at "
+                "most."
+            )
+
+
+@dataclass
 class WandBSettings:
     """Weights & Biases, off by default."""
 
@@ -171,6 +204,7 @@ class RunConfig:
     threads: int = number(0, least=0, most=256)  # torch threads; 0 leaves torch's choice
     replay: ReplaySettings = field(default_factory=ReplaySettings)
     eval: EvalSettings = field(default_factory=EvalSettings)
+    ray: RaySettings = field(default_factory=RaySettings)
     tensorboard: bool = False  # the tables as TensorBoard events in output_dir/tensorboard, too
     wandb: WandBSettings = field(default_factory=WandBSettings)
 
@@ -188,6 +222,7 @@ class RunConfig:
         if self.policy.push_to_hub:
             check_repo_id(self.policy.repo_id or "", "--policy.repo_id")
         acts_in = self._validated_world()
+        self.ray.validate(beside=self.async_updates)
         if self.policy.base_path is not None:
             self._check_correction(self.policy)
         recipe = self.recipe

@@ -54,7 +54,7 @@ FLOORS: dict[str, str] = {
     ),
     "train": (
         "interfaces|clock envs|robot|operator sim_arm|config agent replay run loop arm "
-        "push|arguments|virtual_so101 build cli|bench|demo"
+        "push|arguments|virtual_so101 build execute cluster cli|bench|demo"
     ),
 }
 
@@ -62,7 +62,7 @@ FLOORS: dict[str, str] = {
 OPTIONAL = frozenset(
     {
         "mujoco", "matplotlib", "wandb", "tensorboard", "fastapi", "uvicorn", "h5py", "zarr", "rliable", "metaworld",
-        "dm_control", "cryptography", "gym_hil", "gym_pusht", "gym_aloha", "rlbench", "pyrep",
+        "dm_control", "cryptography", "gym_hil", "gym_pusht", "gym_aloha", "rlbench", "pyrep", "ray",
     }
 )  # fmt: skip
 # Modules that need one at their top; they in turn are imported only inside functions or by one another.

@@ -139,11 +139,11 @@ def run(
     stopped = False
     with ConsoleMonitor() as monitor, contextlib.ExitStack() as stack:
         trainer = build(parse(arguments).validate(), monitor, lambda: bool(asked), stack, SimUR5e.clock)
-        assert isinstance(trainer.env, ArmEnvironment)
-        assert isinstance(trainer.person, Session)
+        assert isinstance(trainer.experience.env, ArmEnvironment)
+        assert isinstance(trainer.experience.person, Session)
         assert isinstance(trainer.clock, DrivenClock)
-        trainer.env.display = Display()
-        hands = Hands(trainer.person, trainer.env, plan, trainer.clock)
+        trainer.experience.env.display = Display()
+        hands = Hands(trainer.experience.person, trainer.experience.env, plan, trainer.clock)
         prepare(trainer, hands)
         with hands:
             try:
@@ -202,7 +202,7 @@ def test_what_a_person_drives_is_learned_from_though_it_failed(demonstrations: l
     sent: list[np.ndarray] = []
 
     def prepare(trainer: Trainer, hands: Hands) -> None:
-        step = trainer.env.step
+        step = trainer.experience.env.step
 
         def spy(action: Any) -> Any:
             outcome = step(action)
@@ -210,7 +210,7 @@ def test_what_a_person_drives_is_learned_from_though_it_failed(demonstrations: l
                 sent.append(np.append(outcome.sent[0].numpy(), outcome.taught))
             return outcome
 
-        trainer.env.step = spy  # type: ignore[method-assign]
+        trainer.experience.env.step = spy  # type: ignore[method-assign]
         hands.during[0] = lambda: (
             hands.session.apply(Event.TAKE_OVER), hands.drive(8), hands.session.apply(Event.PAUSE),
             hands.clock.sleep(0.05), hands.session.apply(Event.RESUME), hands.drive(4),
@@ -247,8 +247,8 @@ def test_a_stopped_run_goes_on_with_the_next_number(demonstrations: list[str], t
     assert stopped
     assert sorted(places(again)) == [0, 1, 3]
     assert again.counters.episodes == 4
-    assert isinstance(again.person, Session)
-    assert again.person.labels == {2: Label.DISCARD, 3: Label.SUCCESS}
+    assert isinstance(again.experience.person, Session)
+    assert again.experience.person.labels == {2: Label.DISCARD, 3: Label.SUCCESS}
     rows = tables(tmp_path / "run")["episodes"]
     assert [int(row["episode"]) for row in rows] == [0, 1, 3]
     steps = [int(row["env_steps"]) for row in rows]
@@ -314,8 +314,8 @@ def test_minutes_are_of_acting_and_learning_and_not_of_waiting(
     passed = clock.now - began
     assert not stopped  # the run is complete
     assert trainer.counters.episodes >= 2
-    assert trainer.env.waited_s >= 0.5  # of the pause, once it is noticed
-    assert 0.72 <= trainer.counters.online_s <= passed - trainer.env.waited_s
+    assert trainer.experience.env.waited_s >= 0.5  # of the pause, once it is noticed
+    assert 0.72 <= trainer.counters.online_s <= passed - trainer.experience.env.waited_s
     assert len(shown) == trainer.counters.episodes
     assert all(done <= 1 for done, _ in shown)  # seconds of 0.72, not steps of 30,000
     assert (tmp_path / "run/checkpoints/last/pretrained_model").is_dir()

@@ -155,11 +155,11 @@ def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> DatasetSettings:
 
 
 def test_home_is_where_the_demonstrations_start(demonstrations: DatasetSettings) -> None:
-    assert home_of(Demonstrations(demonstrations), robot(), ArmSettings()).tolist() == [2, 10, 50, 20]
+    assert home_of(Demonstrations(demonstrations).first_states(), robot(), ArmSettings()).tolist() == [2, 10, 50, 20]
     given = ArmSettings(home={"gripper.pos": 0.0})
-    assert home_of(Demonstrations(demonstrations), robot(), given).tolist() == [2, 10, 0, 20]
+    assert home_of(Demonstrations(demonstrations).first_states(), robot(), given).tolist() == [2, 10, 0, 20]
     some = DatasetSettings("local/arm", demonstrations.root, [2])
-    assert home_of(Demonstrations(some), robot(), ArmSettings()).tolist() == [30, 10, 50, 20]
+    assert home_of(Demonstrations(some).first_states(), robot(), ArmSettings()).tolist() == [30, 10, 50, 20]
 
 
 def test_home_must_be_known_for_every_joint() -> None:

@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from ..config import PageSettings, RunConfig
 from ..interfaces import PAGE_TOKEN
 from ..operator.board import Board
 from ..operator.session import Session
-from ..replay.demonstrations import Demonstrations
+from ..replay.demonstrations import Recorded
 from ..robot.arm import Arm, state_names
 from ..robot.guard import Guard, GuardSettings
 from ..robot.limits import Forward, Limits
@@ -63,7 +63,7 @@ def make_operated(
     robot_config: RobotConfig,
     config: RunConfig,
     agent: Agent,
-    demonstrations: Demonstrations | None,
+    recorded: Recorded | None,
     should_stop: Callable[[], bool],
     say: Callable[[str], None],
     clock: Clock = REAL,
@@ -76,14 +76,15 @@ def make_operated(
     leader = _made("teleop", make_teleoperator_from_config, config.teleop) if config.teleop is not None else None
     check_commands(robot)
     check_robot_fits(robot, agent)
-    if demonstrations is not None:
-        _check_names(robot, demonstrations.meta.features)
-    fps = config.arm.fps or (round(demonstrations.meta.fps) if demonstrations is not None else None)
+    if recorded is not None:
+        _check_names(robot, recorded.names)
+    fps = config.arm.fps or (round(recorded.fps) if recorded is not None else None)
     if fps is None:
         raise ConfigError("How many control steps a second? Give --arm.fps (that of the demonstrations).")
-    seen_fps = demonstrations.meta.fps if demonstrations is not None else fps
+    seen_fps = recorded.fps if recorded is not None else fps
     limits = limits_of(robot, agent, config.arm, fps, seen_fps)
-    home = home_of(demonstrations, robot, config.arm) if demonstrations is not None or config.arm.home else None
+    first = recorded.first_states if recorded is not None else None
+    home = home_of(first, robot, config.arm) if recorded is not None or config.arm.home else None
     names = tuple(robot.action_features)
     _check_home(home, names, limits)
     settings = GuardSettings(config.arm.stale_s, config.arm.watchdog_s, current_s=max(CURRENT_S, 2 / fps))
@@ -254,13 +255,12 @@ def limits_of(robot: Robot, agent: Agent, settings: ArmSettings, fps: int, seen_
     return Limits(low=low, high=high, max_step=step, max_speed=step * fps, box=box, forward=forward)
 
 
-def home_of(demonstrations: Demonstrations | None, robot: Robot, settings: ArmSettings) -> Array:
-    """Home [D], where the demonstrations start: the median of their first joints; `arm.home` on top.
+def home_of(first: NDArray[Any] | None, robot: Robot, settings: ArmSettings) -> Array:
+    """Home [D], where the demonstrations start: the median of their first states [K, P]; `arm.home` on top.
 
     Raises ConfigError for a joint of which neither says it.
     """
     names, home = tuple(robot.action_features), dict[str, float]()
-    first = demonstrations.first_states() if demonstrations is not None else None
     if first is not None:
         home = dict(zip(state_names(robot), np.median(first, axis=0).tolist(), strict=True))
     home |= settings.home
@@ -287,13 +287,13 @@ def _made(kind: str, make: Callable[[Any], Any], config: Any) -> Any:
         raise ConfigError(f"The device of --{kind}.type cannot be made: {error}") from error
 
 
-def _check_names(robot: Robot, features: dict[str, Any]) -> None:
+def _check_names(robot: Robot, recorded: Mapping[str, list[str]]) -> None:
     """A robot with other joints, or in another order, would be driven wrongly. Raises DataError."""
     states = state_names(robot)
     for key, own in ((OBS_STATE, states), (ACTION, list(robot.action_features))):
-        names = features.get(key, {}).get("names")
-        if isinstance(names, list | tuple) and list(names) != own:
-            raise DataError(f"The dataset's {key} is {list(names)}, the robot's {own}: use the robot of the dataset.")
+        names = recorded.get(key, own)
+        if names != own:
+            raise DataError(f"The dataset's {key} is {names}, the robot's {own}: use the robot of the dataset.")
 
 
 def _forward(robot: Robot, settings: ArmSettings) -> Forward:

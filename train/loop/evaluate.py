@@ -35,6 +35,12 @@ class Evaluation:
     courses: list[Course] = field(default_factory=list)
     frames: list[list[NDArray[Any]]] = field(default_factory=list)
 
+    @classmethod
+    def together(cls, parts: Sequence["Evaluation"], episodes: int) -> "Evaluation":
+        """Evaluations of some episodes each as one of the first `episodes`."""
+        names = [one.name for one in fields(cls)]
+        return cls(**{name: [one for part in parts for one in getattr(part, name)][:episodes] for name in names})
+
     @property
     def n(self) -> int:
         """Episodes."""
@@ -99,13 +105,10 @@ def evaluate(
     on_step: called before each control step; what it raises ends the evaluation. film: episodes to take pictures of.
     Episode i has seed + i, however many run at a time.
     """
-    total = Evaluation()
-    for first in range(0, episodes, scenes.count):
-        wave = _wave(agent, scenes, seed + first, max(0, film - first), on_step)
-        count = min(scenes.count, episodes - first)
-        for field_ in fields(Evaluation):
-            getattr(total, field_.name).extend(getattr(wave, field_.name)[:count])
-    return total
+    waves = [
+        _wave(agent, scenes, seed + first, max(0, film - first), on_step) for first in range(0, episodes, scenes.count)
+    ]
+    return Evaluation.together(waves, episodes)
 
 
 def _wave(agent: Agent, scenes: Scenes, seed: int, film: int, on_step: Callable[[], None]) -> Evaluation:

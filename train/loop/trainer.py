@@ -1,13 +1,13 @@
 """The loop: offline updates on the demonstrations, then acting and learning (Algorithm 2)."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+import sys
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lerobot_cqn.learner import Learner, NonFiniteLossError
 from lerobot_cqn.schema import Batch
@@ -15,21 +15,22 @@ from lerobot_cqn.schema import Batch
 from ..agent import Agent
 from ..clock import REAL, Clock
 from ..config import RunConfig
-from ..interfaces import Environment, Interrupted, Label, Monitor, Outcome, Person, Scenes
+from ..interfaces import Interrupted, Label, Monitor
 from ..replay.buffer import Replay
 from ..replay.course import Course, Shown, describe
 from ..replay.demonstrations import counts_as_demonstration
 from ..replay.episode import Episode
 from ..replay.files import Place
-from ..replay.recorder import Recorder
 from ..run.checkpoint import Counters
 from ..run.durable import SpareDescriptors, check_room
 from ..run.first_look import save_batch, write_films
 from ..run.judgement import unconverged
 from ..run.metrics import Metrics, read_rows
+from .acting import Finished, Turn
 from .background import Background
 from .diagnosis import diagnose, episode_rows, shown_in
-from .evaluate import EVAL_SEED, FINAL_SEED, Evaluation, evaluate
+from .evaluate import EVAL_SEED, FINAL_SEED, Evaluation
+from .experience import Experience
 
 __all__ = ["Trainer"]
 
@@ -45,8 +46,7 @@ class Trainer:
     config: RunConfig
     agent: Agent
     learner: Learner
-    env: Environment
-    scenes: Scenes
+    experience: Experience
     replay: Replay
     metrics: Metrics
     monitor: Monitor
@@ -54,7 +54,6 @@ class Trainer:
     counters: Counters
     save: Callable[[], None]
     should_stop: Callable[[], bool]
-    person: Person
     spare: SpareDescriptors
     evaluations: list[tuple[str, Evaluation]] = field(default_factory=list)
     finished_since: Sequence[Place] = ()
@@ -63,13 +62,16 @@ class Trainer:
     clock: Clock = REAL
     _counted_at: float = field(init=False)
     _shown: Shown = field(init=False)
+    _learned: int = field(init=False)  # control steps whose updates are made, or owed
+    _number: int = field(init=False)  # of the next turn
 
     def __post_init__(self) -> None:
         self._counted_at, self._shown = self.clock.now, shown_in(self.replay)
+        self._learned, self._number = self.counters.env_steps, self.counters.episodes
 
     def run(self) -> None:
         """Offline phase, online phase, final evaluation. Raises Interrupted between two updates or steps."""
-        self.env.open()
+        self.experience.open([key for place in self.replay.places if (key := place.note.get("key"))])
         if self.counters == Counters():
             self.save()  # from here on the run can be continued
         self.take_up(self.finished_since)
@@ -85,12 +87,12 @@ class Trainer:
     def _offline(self) -> None:
         total = self.config.offline_updates
         self.monitor.phase("offline", total, self.counters.updates)
-        self.person.learning("offline updates")
+        self.experience.learning("offline updates")
         while self.replay.episodes and self.counters.updates < total:
             until = self.clock.now + OFFLINE_SAVE_S
             self.updates(
                 total - self.counters.updates,
-                on_update=lambda: self.monitor.advance(self.counters.updates, ""),
+                on_update=self._tell_offline,
                 until=lambda until=until: self.clock.now > until,  # type: ignore[misc]
             )
             if self.counters.updates < total:
@@ -106,20 +108,24 @@ class Trainer:
         self.counters.offline_done = True
         self.save()
 
+    def _tell_offline(self) -> None:
+        self.monitor.advance(self.counters.updates, "")
+        self.experience.tend(self.agent, self._turn, sys.maxsize)  # no turn begins yet
+
     def _online(self) -> None:
         c = self.counters
         self.monitor.phase(*self._online_progress())
         while c.env_steps < self.config.steps and not self._out_of_time():
-            before, number, began, waited = c.env_steps, c.episodes, self.clock.now, self.env.waited_s
-            try:
-                self.episode()
-            except (Interrupted, OSError):  # the unfinished episode is dropped, so its steps do not count either
-                c.env_steps = before if c.episodes == number else c.env_steps
-                raise
+            before, began, waited = c.env_steps, self.clock.now, self.experience.waited_s
+            self.episode()
             self._correct()
-            self.updates(self.config.recipe.updates_of_episode(c.env_steps), on_update=self._tell_updates)
-            c.online_s += self.clock.now - began - (self.env.waited_s - waited)
+            self.learn(self.config.recipe.updates_of_episode(c.env_steps))
+            c.online_s += self.clock.now - began - (self.experience.waited_s - waited)
             self._look_and_save(before)
+        for finished in self.experience.rest():
+            self._store(finished)
+            self._learn_steps()
+            self.learn(self.config.recipe.updates_of_episode(c.env_steps))
 
     def _look_and_save(self, before: int) -> None:
         """Evaluate and save where the steps since `before` say so."""
@@ -128,78 +134,107 @@ class Trainer:
             self.evaluate("online", self.config.eval.n_episodes)
         check_room(self.metrics.output_dir)  # while a last checkpoint still fits
         if c.env_steps // self.config.save_freq > before // self.config.save_freq:
-            self.person.learning("saving a checkpoint")
+            self.experience.learning("saving a checkpoint")
             self.save()
 
     def episode(self) -> None:
-        """Act once from reset to end, learn while acting, and store what happened."""
-        c, recorder = self.counters, Recorder(self.agent)
-        self.agent.reset()
-        self.person.expect(c.episodes)
-        # The seed follows from the episode's number: a resumed run meets the same scenes.
-        frame = self.env.reset(self.config.seed * 100_000 + c.episodes)
-        prepared = self.agent.prepare(frame)
-        recorder.observe(prepared, frame)
-        values: list[float] = []
-        ended = False
-        try:
-            with self._background() as agent:
-                while len(recorder) < self.env.max_steps:
-                    at_random = c.env_steps < self.config.recipe.random_steps
-                    action, q = agent.act(prepared, explore=True, at_random=at_random)
-                    outcome = self.env.step(agent.postprocessor(action))
-                    executed = agent.carried_out(action, outcome)
-                    prepared = agent.prepare(outcome.frame)
-                    if outcome.skipped:
-                        recorder.retake(prepared, outcome.frame, outcome.reward)
-                        agent.retake(first=not len(recorder))
-                    else:
-                        recorder.step(executed, outcome.reward, taught=outcome.taught)
-                        recorder.observe(prepared, outcome.frame)
-                        values.append(float(q[0]))
-                        c.env_steps += 1
-                        self.updates(self.config.recipe.updates_of_steps(c.env_steps - 1, c.env_steps))
-                    if self.should_stop():
-                        raise Interrupted
-                    if outcome.ended:
-                        break
-                ended = True
-        finally:
-            if ended:  # also where the learner beside it failed: the person's work is not lost
-                with self.spare.given():
-                    self._store(recorder, outcome, np.array(values))
+        """Take in the next episode, learn while it is acted or afterwards, and store what happened."""
+        c, before, owed = self.counters, self.counters.env_steps, self.counters.owed
+        agent, beside = self.agent, None
+        if self.config.async_updates:  # what acts is a copy, while the original learns beside it
+            agent = replace(agent, policy=deepcopy(agent.policy))
+            beside = Background(lambda stop: self.updates(self.config.async_updates, until=stop))
 
-    def _store(self, recorder: Recorder, outcome: Outcome, values: NDArray[Any]) -> None:
+        def on_step(steps: int) -> None:
+            nonlocal beside
+            if beside is not None:  # the episode has begun
+                learning.enter_context(beside)
+                beside = None
+            c.env_steps = steps
+            self._learn_steps()
+            if self.should_stop():
+                raise Interrupted
+
+        finished: Finished | None = None
+        try:
+            with contextlib.ExitStack() as learning:
+                finished = self.experience.collect(agent, self._turn, on_step)
+        finally:
+            c.env_steps = before
+            if finished is None:  # it is dropped: neither its steps count nor what was still to be learned in it
+                self._learned, c.owed = before, owed
+            else:  # also where the learner beside it failed: the person's work is not lost
+                with self.spare.given():
+                    self._store(finished)
+        self._learn_steps()
+
+    def _turn(self, waiting: int) -> Turn | None:
+        """The next episode to act, where `waiting` control steps are not stored yet; None: the run has enough.
+
+        Its scene follows from its number: a resumed run meets the same.
+        """
+        if self.counters.env_steps + waiting >= self.config.steps or self._out_of_time():
+            return None
+        number = self._free_number()
+        return Turn(number=number, seed=self.config.seed * 100_000 + number, steps=self.counters.env_steps)
+
+    def _free_number(self) -> int:
+        """A number that no other episode of the run has."""
+        number = max(self._number, self.counters.episodes)
+        self._number = number + 1
+        return number
+
+    def _learn_steps(self) -> None:
+        """Make the updates of the control steps that have none yet."""
+        before, self._learned = self._learned, self.counters.env_steps
+        self.learn(self.config.recipe.updates_of_steps(before, self._learned))
+
+    def learn(self, count: int) -> None:
+        """Make `count` updates and those still owed; what an interrupt leaves is owed, also by a resumed run."""
+        if not self.replay.episodes:  # without demonstrations learning begins after the first episode
+            return
+        self.counters.owed += count
+        self.updates(self.counters.owed, on_update=self._made_one)
+
+    def _made_one(self) -> None:
+        self.counters.owed -= 1
+        self.experience.learning(f"update {self.counters.updates}")
+        self.experience.tend(self.agent, self._turn, self.counters.owed)
+
+    def _store(self, finished: Finished) -> None:
         """Keep a finished episode and say how it went."""
-        c, number = self.counters, self.counters.episodes
-        c.episodes += 1
-        if not len(recorder):
+        c, turn, episode = self.counters, finished.turn, finished.episode
+        taken = any(place.number == turn.number for place in self.replay.places)
+        number = self._free_number() if taken else turn.number
+        c.episodes, c.env_steps = max(c.episodes, number + 1), c.env_steps + finished.steps
+        if episode is None:
             self.monitor.message(f"Episode {number} had no step.")
             return
-        episode = recorder.episode(terminated=outcome.terminated, success=outcome.success)
-        demo = counts_as_demonstration(self.config.recipe, success=outcome.success)
+        demo = counts_as_demonstration(self.config.recipe, success=finished.success)
+        values = finished.values
         row = {
-            "episode": number, "length": len(episode), "success": int(outcome.success),
+            "episode": number, "length": len(episode), "success": int(finished.success),
             "return": float(episode.reward.sum()), "mean_q": float(values.mean()),
             **describe(Course(states=episode.low_dim, actions=episode.action, values=values), self._shown),
-            "taught": sum(recorder.taught), "demonstrations": self.replay.demonstrations + demo, **self._progress(),
-        }  # fmt: skip
-        if outcome.discarded:
+            "taught": sum(last - first for first, last in episode.taught),
+            "demonstrations": self.replay.demonstrations + demo, **self._progress(),
+        } | ({"key": turn.key} if turn.key else {})  # fmt: skip
+        if finished.discarded:
             self._aside = dict([*self._aside.items(), (number, (episode, row))][-SET_ASIDE:])
             self.monitor.message(f"Episode {number} is discarded: nothing is learned from it.")
-            return
-        self.replay.add(episode, demo=demo, number=number, note=row)
-        self.metrics.write("episodes", row)
-        self._recent = [*self._recent, outcome.success][-RECENT:]
-        lately = f"success {sum(self._recent)}/{len(self._recent)} lately"
-        steps = f"step {c.env_steps}  " if self.config.online_minutes is not None else ""
-        self.monitor.advance(
-            self._online_progress()[2], f"{steps}episode {c.episodes}  {lately}  Q {values.mean():+.2f}"
-        )
+        else:
+            self.replay.add(episode, demo=demo, number=number, note=row)
+            self.metrics.write("episodes", row)
+            self._recent = [*self._recent, finished.success][-RECENT:]
+            lately = f"success {sum(self._recent)}/{len(self._recent)} lately"
+            steps = f"step {c.env_steps}  " if self.config.online_minutes is not None else ""
+            note = f"{steps}episode {c.episodes}  {lately}  Q {values.mean():+.2f}"
+            self.monitor.advance(self._online_progress()[2], "  ".join(filter(None, (note, self.experience.note))))
+        self.experience.stored(finished)
 
     def _correct(self) -> None:
         """Learn from now on what a person says otherwise about finished episodes."""
-        for number, label in self.person.take_corrected().items():
+        for number, label in self.experience.take_corrected().items():
             success = label is Label.SUCCESS
             demo = counts_as_demonstration(self.config.recipe, success=success)
             if label is Label.DISCARD:
@@ -223,19 +258,6 @@ class Trainer:
     def _out_of_time(self) -> bool:
         minutes = self.config.online_minutes
         return minutes is not None and self.counters.online_s >= 60 * minutes
-
-    def _tell_updates(self) -> None:
-        self.person.learning(f"update {self.counters.updates}")
-
-    @contextlib.contextmanager
-    def _background(self) -> Iterator[Agent]:
-        """The agent that acts in an episode: with asynchronous updates a copy, while the original learns beside it."""
-        if not self.config.async_updates:
-            yield self.agent
-            return
-        acting = replace(self.agent, policy=deepcopy(self.agent.policy))
-        with Background(lambda stop: self.updates(self.config.async_updates, until=stop)):
-            yield acting
 
     def updates(
         self, count: int, on_update: Callable[[], None] = lambda: None, until: Callable[[], bool] = lambda: False
@@ -268,18 +290,19 @@ class Trainer:
     def take_up(self, places: Sequence[Place]) -> None:
         """Episodes that were finished after the last checkpoint: they count, and their updates are made again."""
         recipe, owed = self.config.recipe, 0
-        # By number: an episode that was discarded at first was stored after later ones.
-        for place in sorted(places, key=lambda place: place.number):
+        # In the order of their ends: one that was discarded at first was stored after later ones.
+        for place in sorted(places, key=lambda place: (int(place.note["env_steps"]), place.number)):
             self.metrics.write("episodes", place.note)
             before, after = self.counters.env_steps, int(place.note["env_steps"])
-            self.counters.episodes, self.counters.env_steps = place.number + 1, after
-            owed += recipe.updates_of_steps(before, after) + recipe.updates_of_episode(after)
+            self.counters.episodes = max(self.counters.episodes, place.number + 1)
+            self.counters.env_steps = self._learned = max(before, after)
+            owed += recipe.updates_of_steps(before, max(before, after)) + recipe.updates_of_episode(after)
         if places:
             self.monitor.message(
                 f"{len(places)} episodes that ended after the last checkpoint are kept; their {owed} updates are made "
                 "again."
             )
-        self.updates(owed)
+        self.learn(owed)
 
     def evaluate(self, phase: str, episodes: int) -> None:
         """Success rate of the deterministic policy; its random state is kept apart from training's."""
@@ -290,14 +313,13 @@ class Trainer:
             if self.should_stop():
                 raise Interrupted
 
-        self.person.expect(None)
         films, seed = self.config.eval.videos, EVAL_SEED if phase == "online" else FINAL_SEED
-        result = evaluate(self.agent, self.scenes, episodes, seed=seed, on_step=look, film=films)
-        rows = episode_rows(result, self._shown, self.scenes.max_steps)
+        result = self.experience.evaluate(self.agent, episodes, seed, look, films)
+        rows = episode_rows(result, self._shown, self.experience.max_steps)
         if films:
             stem = f"{phase}_{self.counters.env_steps:06d}"
             labels = [f"failure {each['how']}".replace(" ", "_") if each["how"] else "success" for each in rows]
-            write_films(result.frames, labels, self.metrics.output_dir / "videos", stem, self.env.fps)
+            write_films(result.frames, labels, self.metrics.output_dir / "videos", stem, self.experience.fps)
         self.evaluations.append((phase, result))
         low, high = result.interval
         row = {

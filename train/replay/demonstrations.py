@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from ..agent import Agent
 from ..config import DatasetSettings, Recipe
 from .episode import Episode, spans
 
-__all__ = ["Demonstrations", "counts_as_demonstration", "load_metadata"]
+__all__ = ["Demonstrations", "Recorded", "counts_as_demonstration", "load_metadata"]
 
 logger = logging.getLogger(__name__)
 
@@ -66,6 +67,19 @@ def load_metadata(settings: DatasetSettings) -> LeRobotDatasetMetadata:
     return meta
 
 
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """What an arm is to know of the demonstrations: it may be on another machine than they.
+
+    fps: their frames a second; names: of the numbers of each feature that has some; first_states: where their episodes
+    began, [K, P], None where no state was recorded.
+    """
+
+    fps: float
+    names: dict[str, list[str]]
+    first_states: NDArray[Any] | None
+
+
 class Demonstrations:
     """Demonstrations of a LeRobotDataset: metadata is read when this is made, rows and pictures when asked for.
 
@@ -91,6 +105,12 @@ class Demonstrations:
 
     def _refuse_damaged(self, root: Path) -> None:
         refuse_damaged(open_source(self.settings.repo_id, str(root)), self.settings.episodes)
+
+    def recorded(self) -> Recorded:
+        """What an arm is to know of them."""
+        named = {key: feature.get("names") for key, feature in self.meta.features.items()}
+        names = {key: list(given) for key, given in named.items() if isinstance(given, list | tuple)}
+        return Recorded(fps=self.meta.fps, names=names, first_states=self.first_states())
 
     def first_states(self) -> NDArray[Any] | None:
         """The state at the start of each episode, [K, P]; None where none was recorded."""

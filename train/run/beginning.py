@@ -15,7 +15,16 @@ __all__ = ["BEGUN", "PAGE", "beginning", "forget_beginning"]
 
 BEGUN = ".begun"  # in the run's folder, locked by the process that begins it
 PAGE = "page"  # certificate and address of the operator's page, made before anything else
-MADE = ("replay", "checkpoints", PAGE, "tensorboard", "first_batch.png", *(f"{table}.csv" for table in COLUMNS), BEGUN)
+MADE = (
+    "replay",
+    "checkpoints",
+    PAGE,
+    "tensorboard",
+    "first_batch.png",
+    "run_id",
+    *(f"{table}.csv" for table in COLUMNS),
+    BEGUN,
+)
 
 
 @contextlib.contextmanager

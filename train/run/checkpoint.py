@@ -47,6 +47,7 @@ class Counters:
     updates: int = 0
     offline_done: bool = False
     wall_s: float = 0.0
+    owed: int = 0  # updates that an interrupt left to be made
     online_s: float = 0.0  # acting and learning online, without waiting for a person
 
 

@@ -1,0 +1,87 @@
+"""Learner and collectors that die at random moments: no finished episode is lost or stored twice."""
+
+import json
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cqn_train.arguments import parse
+from cqn_train.cluster import fleet
+from cqn_train.cluster.launch import settings_of
+from cqn_train.cluster.learner import Learner
+from cqn_train.replay.files import Journal
+
+from ..threaded_calls import ThreadedCalls
+from .conftest import TINY_RUN
+
+RUN = [*TINY_RUN, "--eval.freq=0", "--save_freq=40", "--threads=1", "--ray.actors=3", "--ray.max_staleness=20"]
+
+
+@pytest.fixture(autouse=True)
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet, "RETRY_S", 0.05)
+    monkeypatch.setattr(fleet, "PULSE_S", 0.02)
+
+
+def stored(run: Path) -> list[str]:
+    return [place.note["key"] for _, place in Journal(run / "replay" / "episodes.jsonl").entries() if place]
+
+
+class Killed(BaseException):
+    """The learner's process is gone."""
+
+
+@pytest.mark.parametrize(("seed", "dies"), [(0, 0.0), (1, 0.1), (2, 0.3)])
+def test_collectors_that_die_cost_no_finished_episode(click: list[str], tmp_path: Path, seed: int, dies: float) -> None:
+    arguments = [*RUN, *click, "--steps=300", f"--output_dir={tmp_path / 'run'}"]
+    calls = ThreadedCalls(settings_of(parse(arguments)), tmp_path / "kept", dies, seed)
+    ended = Learner(arguments, calls, 1).run()
+    assert (ended.code, ended.error) == (0, "")
+    assert calls.deaths > 0 or not dies
+    keys = stored(tmp_path / "run")
+    assert sorted(keys) == sorted({*keys})
+    assert {*keys} == {*calls.spool.seen}
+    rows = json.loads(
+        json.dumps(
+            [place.note for _, place in Journal(tmp_path / "run" / "replay" / "episodes.jsonl").entries() if place]
+        )
+    )
+    assert len({row["episode"] for row in rows}) == len(rows)
+    steps = [row["env_steps"] for row in rows]
+    assert steps == sorted(steps)
+    assert steps[-1] == sum(row["length"] for row in rows)
+
+
+def test_a_learner_that_dies_takes_up_what_its_collectors_kept(
+    click: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The collectors live on, and finish what they were at."""
+    arguments = [*RUN, *click, "--steps=400", f"--output_dir={tmp_path / 'run'}"]
+    calls = ThreadedCalls(settings_of(parse(arguments)), tmp_path / "kept", 0.05, 3)
+    rng, collect = random.Random(0), fleet.Fleet.collect
+
+    def dies(self: fleet.Fleet, *given: Any) -> Any:
+        finished = collect(self, *given)
+        if rng.random() < 0.25:
+            raise Killed  # an episode has come, and is not stored
+        return finished
+
+    monkeypatch.setattr(fleet.Fleet, "collect", dies)
+    deaths = 0
+    while True:
+        try:
+            ended = Learner(arguments, calls, 1).run()
+            break
+        except Killed:
+            deaths += 1
+            arguments = ["--resume=true", f"--output_dir={tmp_path / 'run'}"]
+            if deaths == 6:
+                monkeypatch.setattr(fleet.Fleet, "collect", collect)
+    assert ended.code == 0, ended.error
+    assert deaths > 2
+    keys = stored(tmp_path / "run")
+    assert sorted(keys) == sorted({*keys})
+    assert {*keys} == {*calls.spool.seen}
+    assert not list(calls.spool.folder.glob("*.npz"))
