@@ -39,7 +39,7 @@ from ..run.beginning import PAGE
 from ..run.metrics import read_rows
 from .environment import ArmEnvironment
 
-__all__ = ["Operated", "make_operated", "recall", "steering"]
+__all__ = ["Operated", "announced", "make_certificate", "make_operated", "recall", "steering"]
 
 Array = NDArray[np.float64]
 # Of a joint's range: the largest step where actions are goals, so that none says how far is usual.
@@ -127,13 +127,13 @@ def steering(config: RunConfig, operated: Operated, say: Callable[[str], None]) 
     from ..operator.page.server import OperatorServer
 
     page, token = config.page, os.environ.get(PAGE_TOKEN) or None
-    certificate = _certificate(page, config.output_dir, say)
+    certificate = make_certificate(page, config.output_dir, say)
     with OperatorServer(operated.board, page.host, page.port, token, page.absent_s, certificate=certificate) as server:
-        say(f"Operator's page: {_announced(server.url, config.output_dir)}")
+        say(f"Operator's page: {announced(server.url, config.output_dir)}")
         yield
 
 
-def _announced(url: str, output_dir: Path | None) -> str:
+def announced(url: str, output_dir: Path | None) -> str:
     """The page's address for a person; without its token where it goes into a log, which others may read."""
     if sys.stdout.isatty() or output_dir is None:
         return url
@@ -145,7 +145,7 @@ def _announced(url: str, output_dir: Path | None) -> str:
     return f"{url.partition('?')[0]} (with its token in {path}, which only you can read)"
 
 
-def _certificate(page: PageSettings, output_dir: Path | None, say: Callable[[str], None]) -> Certificate | None:
+def make_certificate(page: PageSettings, output_dir: Path | None, say: Callable[[str], None]) -> Certificate | None:
     """For https where it was asked for. Raises ConfigError for files that cannot be used."""
     if page.certfile and page.keyfile:
         return check_certificate(page.certfile, page.keyfile)

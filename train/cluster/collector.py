@@ -4,6 +4,7 @@ import contextlib
 import os
 import platform
 import socket
+import tempfile
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -140,6 +141,8 @@ class Collector:
             if config.threads:
                 torch.set_num_threads(config.threads)
             seed_everything(config.seed)
+            # Certificate and address of its page; the run's own folder may be on another machine.
+            config.output_dir = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="cqn-collector-")))
             if isinstance(config.env, EnvConfig):
                 assert config.policy is not None  # noqa: S101  # RunConfig.validate has checked it
                 self._gym = GymEnvironment(config.env, config.policy)

@@ -3,19 +3,24 @@
 import contextlib
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import draccus
 
 from lerobot_cqn.errors import ConfigError, CQNError
 
+from ..arm.build import announced, make_certificate
 from ..config import RunConfig, ValidRun
-from ..interfaces import Monitor
+from ..interfaces import PAGE_TOKEN, Monitor
 from ..run.checkpoint import last_checkpoint
+from ..run.progress import Monitors
 from .collector import Collector
 from .connect import RayCalls, check_resource, connected
 from .learner import Ended, Learner, Shown
+from .overview import Overview, server
+
+Seats = Callable[[Sequence[Mapping[str, Any]]], None]
 
 __all__ = ["launch", "settings_of"]
 
@@ -40,22 +45,38 @@ def launch(valid: ValidRun, arguments: Sequence[str], monitor: Monitor, should_s
             actor.options(num_cpus=1, resources=one, max_restarts=-1).remote(index, config, plugins)
             for index, config in enumerate(configs)
         ]
-        try:
-            return _with_learner(ray, valid, list(arguments), RayCalls(collectors), monitor, should_stop)
-        finally:
-            _close(ray, collectors)
+        with _overview(valid, monitor) as (shown, note):
+            try:
+                return _with_learner(ray, valid, list(arguments), RayCalls(collectors), shown, note, should_stop)
+            finally:
+                _close(ray, collectors)
+
+
+@contextlib.contextmanager
+def _overview(valid: ValidRun, monitor: Monitor) -> Iterator[tuple[Monitor, Seats]]:
+    """What shows the run, and what is told of the collectors: with several arms there is a page of all of them."""
+    config = valid.config
+    if config.robot is None or config.ray.actors == 1 or not config.operator_page:
+        yield monitor, lambda _: None
+        return
+    overview = Overview()
+    page, token = config.page, os.environ.get(PAGE_TOKEN) or None
+    certificate = make_certificate(page, valid.output_dir, monitor.message)
+    with server(overview, page.host, page.port, token, certificate) as shown:
+        monitor.message(f"Overview of the arms: {announced(shown.url, valid.output_dir)}")
+        yield Monitors([monitor, overview]), overview.arms
 
 
 def settings_of(config: RunConfig) -> list[Mapping[str, Any]]:
     """The run's settings for each collector, encoded, with those of its own on top. Raises ConfigError for a bad name.
 
-    Pages of several arms have ports of their own, counted up from the run's.
+    With several arms the run's page is the overview; each arm's own has a port of its own, counted up from it.
     """
     found = []
     for index in range(config.ray.actors):
         encoded = draccus.encode(config)
         if config.page.port:
-            encoded["page"]["port"] = config.page.port + index
+            encoded["page"]["port"] = config.page.port + index + (config.ray.actors > 1)
         for name, value in (config.ray.each[index] if index < len(config.ray.each) else {}).items():
             *groups, last = str(name).split(".")
             part: Any = encoded
@@ -76,6 +97,7 @@ def _with_learner(
     arguments: list[str],
     calls: RayCalls,
     monitor: Monitor,
+    note: Seats,
     should_stop: Callable[[], bool],
 ) -> int:
     """Run a learner to its end; one that dies is followed by another that goes on from the last checkpoint."""
@@ -90,7 +112,7 @@ def _with_learner(
     while True:
         begun = _checkpoint_time(valid)
         learner = actor.remote(arguments, calls, threads)
-        ended = _watch(ray, learner, monitor, should_stop)
+        ended = _watch(ray, learner, monitor, note, should_stop)
         if ended is not None:
             if ended.error:
                 raise (CQNError if ended.code == 2 else OSError)(ended.error)
@@ -103,7 +125,7 @@ def _with_learner(
         arguments = ["--resume=true", f"--output_dir={valid.output_dir}"]
 
 
-def _watch(ray: Any, learner: Any, monitor: Monitor, should_stop: Callable[[], bool]) -> Ended | None:
+def _watch(ray: Any, learner: Any, monitor: Monitor, note: Seats, should_stop: Callable[[], bool]) -> Ended | None:
     """Show what a learner does until it ends; None where its process died."""
     running, asked = learner.run.remote(), False
     while True:
@@ -112,6 +134,7 @@ def _watch(ray: Any, learner: Any, monitor: Monitor, should_stop: Callable[[], b
             shown: Shown = ray.get(learner.look.remote())
             for name, given in shown.calls:
                 getattr(monitor, name)(*given)
+            note(shown.seats)
             if done:
                 ended: Ended = ray.get(running)
                 return ended
