@@ -1,5 +1,6 @@
 """`cqn-train --ray.actors=N` over Ray itself: the same run as in one process, processes that are killed, refusals."""
 
+import socket
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,12 @@ from .test_cqn_train import assert_same_run, tables
 from .zygote import Zygote, wait_until
 
 TURNS = ["--threads=1", "--ray.actors=1", "--ray.max_staleness=0"]
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def stored(run: Path) -> list[str]:

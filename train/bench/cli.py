@@ -9,7 +9,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.live import Live
@@ -18,13 +20,16 @@ from rich.table import Table
 from cqn_data.terminal.console import explain
 from lerobot_cqn.errors import ConfigError, CQNError, one_of
 
-from .plan import Run, load_plan, runs_of
+from .plan import Begin, Run, begin_here, load_plan, runs_of
+
+if TYPE_CHECKING:
+    from ..config import RaySettings
 
 __all__ = ["HELP", "main"]
 
 HELP = """cqn-bench: train every method on every task with every seed, then compare.
 
-Usage: cqn-bench PLAN.yaml --output_dir=DIR [--processes=2] [--report_only] [--debug]
+Usage: cqn-bench PLAN.yaml --output_dir=DIR [--processes=2] [--ray.address=HOST:PORT] [--report_only] [--debug]
 
 A plan is a YAML file:
 
@@ -40,12 +45,15 @@ A plan is a YAML file:
 
 DIR/TASK/METHOD/SEED is a run as cqn-train leaves it; DIR/results.csv, results.md, table.png, aggregate.png, curves.csv
 and curves.png are made anew at the end (they need pip install 'lerobot_policy_cqn[bench]'). Ctrl-C stops all runs with
-their checkpoints; the same command continues.
+their checkpoints; the same command continues. With --ray.address (or "auto") the runs are made on the nodes of a Ray
+cluster, as many at a time as it has processors; DIR, and the data, must be on a disk that all of them share.
 """
 STOPS_WITHIN_S = 60.0  # seconds that runs have to save after Ctrl-C
 
 
-def work(runs: Sequence[Run], processes: int, console: Console, score: str = "success_rate") -> None:
+def work(
+    runs: Sequence[Run], processes: int, console: Console, score: str = "success_rate", begin: Begin = begin_here
+) -> None:
     """Run all that are not done, `processes` at a time. Raises KeyboardInterrupt once all have stopped and saved."""
     for run in runs:
         run.state = "done" if run.done else "waiting"
@@ -56,7 +64,7 @@ def work(runs: Sequence[Run], processes: int, console: Console, score: str = "su
             while waiting or any(run.process for run in runs):
                 running = [run for run in runs if run.process]
                 for run in waiting[: processes - len(running)]:
-                    run.start()
+                    run.start(begin)
                     waiting.remove(run)
                 time.sleep(0.3)
                 for run in running:
@@ -70,6 +78,17 @@ def work(runs: Sequence[Run], processes: int, console: Console, score: str = "su
         raise
     if not console.is_terminal:
         console.print()
+
+
+def _work_on_ray(runs: Sequence[Run], settings: "RaySettings", processes: str, console: Console, score: str) -> None:
+    """Run all on a cluster, as many at a time as it has processors. Raises ConfigError where it cannot be joined."""
+    from ..cluster.connect import connected
+    from ..cluster.remote_process import RemoteProcess, check_shared
+
+    with connected(settings, 1) as ray:
+        check_shared(ray, runs[0].folder.parents[2])
+        there = int(ray.cluster_resources().get("CPU", 1))
+        work(runs, int(processes or there), console, score, partial(RemoteProcess, ray))
 
 
 def check(runs: Sequence[Run]) -> None:
@@ -101,7 +120,7 @@ def _stop(runs: Sequence[Run]) -> None:
                 run.process.wait(max(0.1, deadline - time.monotonic()))
             except subprocess.TimeoutExpired:
                 run.process.kill()
-                run.process.wait()
+                run.process.wait(STOPS_WITHIN_S)
 
 
 def _table(runs: Sequence[Run], score: str, seconds: float = 0.0) -> Table:
@@ -120,7 +139,7 @@ def _table(runs: Sequence[Run], score: str, seconds: float = 0.0) -> Table:
 
 
 def _options(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
-    known = ("--output_dir", "--processes", "--report_only")
+    known = ("--output_dir", "--processes", "--report_only", "--ray.address", "--ray.open_network")
     for argument in arguments:
         name, _, value = argument.partition("=")
         if name not in known:
@@ -143,8 +162,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = dict(_options(arguments[1:]))
         if not options.get("output_dir"):
             raise ConfigError("No output directory: give --output_dir=DIR.")
-        processes = options.get("processes", "2")
-        if not processes.isdigit() or int(processes) < 1:
+        processes = options.get("processes", "" if "ray.address" in options else "2")
+        if processes and (not processes.isdigit() or int(processes) < 1):
             raise ConfigError(f"Expected --processes of at least 1, got '{processes}'.")
         folder = Path(options["output_dir"])
         from .report import check_packages, write_report
@@ -154,7 +173,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         runs = runs_of(plan, folder)
         if "report_only" not in options:
             check([run for run in runs if not run.done])
-            work(runs, int(processes), console, plan.score)
+            if "ray.address" in options:
+                from ..config import RaySettings
+
+                settings = RaySettings(
+                    actors=1, address=options["ray.address"], open_network=options.get("ray.open_network") == "true"
+                )
+                _work_on_ray(runs, settings, processes, console, plan.score)
+            else:
+                work(runs, int(processes), console, plan.score)
         write_report(plan, runs, folder, console)
     except KeyboardInterrupt:
         console.print("Stopped; the same command continues.")

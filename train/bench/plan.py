@@ -2,10 +2,10 @@
 
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import yaml
 
@@ -14,7 +14,7 @@ from lerobot_cqn.errors import ConfigError, one_of
 from ..run.metrics import read_rows
 from ..run.progress import last_line
 
-__all__ = ["Plan", "Run", "load_plan", "runs_of"]
+__all__ = ["Begin", "Plan", "Run", "begin_here", "load_plan", "runs_of"]
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Run:
     folder: Path
     arguments: list[str]
     state: str = "waiting"
-    process: "subprocess.Popen[bytes] | None" = field(default=None, repr=False)
+    process: "Process | None" = field(default=None, repr=False)
 
     def rows(self) -> list[dict[str, str]]:
         """Its evaluations so far."""
@@ -60,15 +60,13 @@ class Run:
         """Whether it has its final evaluation."""
         return any(row["phase"] == "final" for row in self.rows())
 
-    def start(self) -> None:
+    def start(self, begin: "Begin") -> None:
         """Begin, or continue from its last checkpoint; what it prints goes to a log beside its folder."""
         resumes = (self.folder / "checkpoints" / "last").exists()
         target = [f"--output_dir={self.folder}"]
         arguments = ["--resume=true", *target] if resumes else [*self.arguments, *target]
         self.folder.parent.mkdir(parents=True, exist_ok=True)
-        with self.folder.with_suffix(".log").open("ab") as log:
-            command = [sys.executable, "-m", "cqn_train.cli", *arguments]
-            self.process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
+        self.process = begin("cqn_train.cli", arguments, self.folder.with_suffix(".log"))
         self.state = "running"
 
     def look(self) -> None:
@@ -78,6 +76,38 @@ class Run:
         code = self.process.returncode
         self.state = "done" if code == 0 and self.done else "stopped" if code == 130 else "failed"
         self.process = None
+
+
+class Process(Protocol):
+    """A run's process, here or on another machine, as `subprocess.Popen` has it."""
+
+    returncode: int | None
+
+    def poll(self) -> int | None:
+        """Exit code; None while it runs."""
+        ...
+
+    def send_signal(self, sig: int) -> None:
+        """Send it a signal."""
+        ...
+
+    def wait(self, timeout: float) -> int:
+        """Exit code. Raises subprocess.TimeoutExpired."""
+        ...
+
+    def kill(self) -> None:
+        """End it at once."""
+        ...
+
+
+Begin = Callable[[str, Sequence[str], Path], Process]
+
+
+def begin_here(module: str, arguments: Sequence[str], log: Path) -> "subprocess.Popen[bytes]":
+    """`python -m module` in a process of this machine, with what it prints in a log."""
+    command = [sys.executable, "-m", module, *arguments]
+    with log.open("ab") as file:
+        return subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, start_new_session=True)
 
 
 def load_plan(path: Path) -> Plan:

@@ -18,7 +18,8 @@ from .fleet import Gone
 
 __all__ = ["RayCalls", "check_resource", "connected"]
 
-STORE_BYTES = 512 * 2**20  # of the object store of a Ray of our own: a few episodes, and weights
+STORE_BYTES = 512 * 2**20  # of the object store of a Ray of our own, for weights,
+STORE_OF_ONE = 32 * 2**20  # and for each collector: a few episodes
 CURRENT = Path("/tmp/ray/ray_current_cluster")  # noqa: S108  # where Ray notes the one that was started last
 ANSWERS_S = 5.0
 LOOPBACK_ONLY = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"  # at 0 all ports of Ray are on this machine alone
@@ -64,7 +65,7 @@ def _joined(settings: RaySettings, actors: int) -> Iterator[Any]:
             resources: dict[str, float] = {settings.robot_resource: actors} if settings.robot_resource else {}
             ray.init(
                 address="local", include_dashboard=False, num_cpus=room, resources=resources,
-                object_store_memory=STORE_BYTES, **common,
+                object_store_memory=STORE_BYTES + actors * STORE_OF_ONE, **common,
             )  # fmt: skip
         else:
             _refuse_open(settings)

@@ -177,12 +177,15 @@ class Fleet:
         """The next episode that is over. Raises Interrupted when asked to stop, or when no collector is left."""
         began = time.monotonic()
         self._begun = self._begun or began
-        while not self._over:
+        while True:
             self._hand_out(agent, next_turn)
-            self._look(WAIT_S, agent, on_step)
+            self._look(0.0 if self._over else WAIT_S, agent, on_step)
+            if self._over:
+                break
             if self.should_stop() or all(seat.state == "left" for seat in self.seats):
                 self._stop()
                 raise Interrupted
+        self._hand_out(agent, next_turn)  # nobody waits until these are stored
         self._learner_s += time.monotonic() - began
         return self._over.popleft()
 
@@ -253,7 +256,7 @@ class Fleet:
 
     def _hand_out(self, agent: Agent, next_turn: Turns, owed: int = 0) -> None:
         owed += sum(self.worth(finished.steps) for finished in self._over)
-        if owed > self.max_staleness or self._enough or self.should_stop():
+        if owed > self.max_staleness or (self._in_turns and self._over) or self._enough or self.should_stop():
             return
         for seat in (seat for seat in self.seats if seat.state == "idle"):
             turn = next_turn(sum(finished.steps for finished in self._over))

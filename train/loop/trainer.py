@@ -175,8 +175,8 @@ class Trainer:
         """
         if self.counters.env_steps + waiting >= self.config.steps or self._out_of_time():
             return None
-        number = self._free_number()
-        return Turn(number=number, seed=self.config.seed * 100_000 + number, steps=self.counters.env_steps)
+        number, steps = self._free_number(), self.counters.env_steps + waiting
+        return Turn(number=number, seed=self.config.seed * 100_000 + number, steps=steps)
 
     def _free_number(self) -> int:
         """A number that no other episode of the run has."""
