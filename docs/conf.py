@@ -34,6 +34,7 @@ CHAPTERS = {
         "docs/datasets",
         "docs/environments",
         "docs/hub",
+        "docs/scale",
         "docs/compatibility",
         "docs/configuration",
         "docs/metrics",

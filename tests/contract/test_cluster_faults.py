@@ -1,6 +1,5 @@
 """Learner and collectors that die at random moments: no finished episode is lost or stored twice."""
 
-import json
 import random
 from pathlib import Path
 from typing import Any
@@ -25,8 +24,13 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fleet, "PULSE_S", 0.02)
 
 
+def notes(run: Path) -> list[dict[str, Any]]:
+    """Rows of the stored episodes, in the order of storing."""
+    return [place.note for _, place in Journal(run / "replay" / "episodes.jsonl").entries() if place]
+
+
 def stored(run: Path) -> list[str]:
-    return [place.note["key"] for _, place in Journal(run / "replay" / "episodes.jsonl").entries() if place]
+    return [note["key"] for note in notes(run)]
 
 
 class Killed(BaseException):
@@ -35,7 +39,7 @@ class Killed(BaseException):
 
 @pytest.mark.parametrize(("seed", "dies"), [(0, 0.0), (1, 0.1), (2, 0.3)])
 def test_collectors_that_die_cost_no_finished_episode(click: list[str], tmp_path: Path, seed: int, dies: float) -> None:
-    arguments = [*RUN, *click, "--steps=300", f"--output_dir={tmp_path / 'run'}"]
+    arguments = [*RUN, *click, "--steps=150", f"--output_dir={tmp_path / 'run'}"]
     calls = ThreadedCalls(settings_of(parse(arguments)), tmp_path / "kept", dies, seed)
     ended = Learner(arguments, calls, 1).run()
     assert (ended.code, ended.error) == (0, "")
@@ -43,11 +47,7 @@ def test_collectors_that_die_cost_no_finished_episode(click: list[str], tmp_path
     keys = stored(tmp_path / "run")
     assert sorted(keys) == sorted({*keys})
     assert {*keys} == {*calls.spool.seen}
-    rows = json.loads(
-        json.dumps(
-            [place.note for _, place in Journal(tmp_path / "run" / "replay" / "episodes.jsonl").entries() if place]
-        )
-    )
+    rows = notes(tmp_path / "run")
     assert len({row["episode"] for row in rows}) == len(rows)
     steps = [row["env_steps"] for row in rows]
     assert steps == sorted(steps)
@@ -58,13 +58,13 @@ def test_a_learner_that_dies_takes_up_what_its_collectors_kept(
     click: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The collectors live on, and finish what they were at."""
-    arguments = [*RUN, *click, "--steps=400", f"--output_dir={tmp_path / 'run'}"]
+    arguments = [*RUN, *click, "--steps=250", f"--output_dir={tmp_path / 'run'}"]
     calls = ThreadedCalls(settings_of(parse(arguments)), tmp_path / "kept", 0.05, 3)
     rng, collect = random.Random(0), fleet.Fleet.collect
 
     def dies(self: fleet.Fleet, *given: Any) -> Any:
         finished = collect(self, *given)
-        if rng.random() < 0.25:
+        if rng.random() < 0.45:
             raise Killed  # an episode has come, and is not stored
         return finished
 
