@@ -7,8 +7,8 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
+from cqn_train.cluster.calls import Gone
 from cqn_train.cluster.collector import Collector
-from cqn_train.cluster.fleet import Gone
 from cqn_train.cluster.spool import Spool
 from cqn_train.loop.acting import Finished
 

@@ -145,6 +145,7 @@ PROBES: dict[str, Extra] = {
     "virtual": Extra(_script("virtual.py"), lambda inputs: ("cqn-virtual-so101", "--task=press_button")),
     "gyms": Extra(_gyms, None, "each environment names its own extra"),
     "bench": Extra(_script("bench.py"), _missing_script("bench.py")),
+    "ray": Extra(_script("ray_actor.py"), _missing_script("ray_actor.py")),
     "page": Extra(_script("page.py"), _missing_script("page.py")),
     "convert": Extra(_convert, lambda inputs: _conversion("robomimic", inputs)),
     "dev": Extra(_develop, None, "tools only"),

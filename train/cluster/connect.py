@@ -14,7 +14,7 @@ from typing import Any
 from lerobot_cqn.errors import ConfigError, CQNError
 
 from ..config import RaySettings
-from .fleet import Gone
+from .calls import Gone
 
 __all__ = ["RayCalls", "check_resource", "connected"]
 

@@ -5,7 +5,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
@@ -18,38 +18,15 @@ from ..loop.evaluate import Evaluation
 from ..loop.experience import Turns
 from ..replay.demonstrations import Recorded
 from .agreement import check_fit, check_versions
+from .calls import Calls, Gone
 from .collector import Description, Done, Fit, Left, NewbornError, Paused, Pulse
 from .parcel import pack, weights_of
 
-__all__ = ["Calls", "Fleet", "Gone"]
+__all__ = ["Fleet"]
 
 PULSE_S = 1.0
 WAIT_S = 0.2  # for an answer, before signals are looked at
 RETRY_S = 3.0  # before a collector that was lost is asked again
-
-
-class Gone(Exception):  # noqa: N818  # a state of affairs
-    """A collector that does not answer: its process, its node or the way there is gone."""
-
-
-class Calls(Protocol):
-    """The way to the collectors: calls that are answered later. Answers raise CQNError, or Gone."""
-
-    def call(self, collector: int, method: str, *arguments: Any) -> Any:
-        """Ask; returns a promise."""
-        ...
-
-    def shared(self, value: Any) -> Any:
-        """Something that several calls can be given and that travels once."""
-        ...
-
-    def answered(self, promises: Sequence[Any], timeout_s: float) -> Sequence[Any]:
-        """Those of the promises that are answered, waiting for the first one so long at most."""
-        ...
-
-    def answer(self, promise: Any) -> Any:
-        """The answer to an answered promise."""
-        ...
 
 
 @dataclass

@@ -21,7 +21,8 @@ from ..config import ValidRun
 from ..execute import execute
 from ..loop.gym_env import check_fits
 from ..replay.demonstrations import Demonstrations
-from .fleet import Calls, Fleet
+from .calls import Calls
+from .fleet import Fleet
 
 __all__ = ["RUN_ID", "Ended", "Learner", "Shown"]
 
