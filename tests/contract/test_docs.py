@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import lerobot.policies.factory  # noqa: F401  # registers the policies that lerobot-train knows
 import pytest
 import yaml
 from lerobot.configs import parser
