@@ -1,8 +1,9 @@
 """Collectors in threads of this process, that die when asked to: what Ray does between processes, in milliseconds."""
 
+import os
 import random
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -39,9 +40,10 @@ class ThreadedCalls:
         self._acting = [ThreadPoolExecutor(1) for _ in configs]
         self._beside = [ThreadPoolExecutor(1) for _ in configs]
         self._lock = threading.Lock()
+        self.before: Callable[[int, str], None] = lambda _index, _method: None  # called in the collector's thread
 
     def _new(self, index: int) -> Collector:
-        collector = Collector(index, self._configs[index], ())
+        collector = Collector(index, self._configs[index], (), os.getcwd())
         collector._spool = self.spool
         return collector
 
@@ -54,6 +56,7 @@ class ThreadedCalls:
         with self._lock:
             before, dies = self._rng.random() < self._dies / 2, self._rng.random() < self._dies / 2
             collector = self._collectors[index]
+        self.before(index, method)
         if before:
             self._die(index)
         answer = getattr(collector, method)(*arguments)

@@ -141,12 +141,15 @@ class RaySettings:
     # join a cluster whose ports other machines reach although it asks for no token: whoever reaches them controls it
     open_network: bool = False
 
-    def validate(self, beside: int) -> None:
-        """Raises ConfigError for values out of range, or where some have no effect. beside: `async_updates`."""
+    def validate(self, *, beside: int, resumed: bool) -> None:
+        """Raises ConfigError for values out of range, or where some have no effect.
+
+        beside: `async_updates`; resumed: the run goes on, perhaps without the collectors that it had.
+        """
         check_ranges(self, "ray.")
         if self.actors and beside:
             raise ConfigError("With collectors learning goes on beside acting: leave out --async_updates.")
-        if not self.actors and self != RaySettings():
+        if not self.actors and not resumed and self != RaySettings():
             raise ConfigError("--ray.… has no effect without collectors: give --ray.actors=N, or leave it out.")
         if len(self.each) > self.actors:
             raise ConfigError(
@@ -222,7 +225,7 @@ class RunConfig:
         if self.policy.push_to_hub:
             check_repo_id(self.policy.repo_id or "", "--policy.repo_id")
         acts_in = self._validated_world()
-        self.ray.validate(beside=self.async_updates)
+        self.ray.validate(beside=self.async_updates, resumed=self.resume)
         if self.policy.base_path is not None:
             self._check_correction(self.policy)
         recipe = self.recipe

@@ -51,11 +51,15 @@ def test_in_turns_with_one_collector_a_run_is_that_of_one_process(
 ) -> None:
     """Every row of every table, and every weight: an update after each control step, and evaluations."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    run = tmp_path / "run"
+    monkeypatch.chdir(tmp_path)
+    run = Path("run")
     assert main([*TINY_RUN, *click, *TURNS, f"--output_dir={run}"]) == 0
     assert_same_run(straight, run)
     assert len(stored(run)) == 6
     assert not list((tmp_path / "cache").rglob("*.npz"))
+    # The run goes on in one process as well.
+    assert main(["--resume=true", "--ray.actors=0", "--steps=70", f"--output_dir={run}"]) == 0
+    assert int(tables(run)["evaluations"][-1]["env_steps"]) == 70
 
 
 def test_killed_processes_cost_no_finished_episode(

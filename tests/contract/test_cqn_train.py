@@ -126,8 +126,8 @@ def test_ctrl_c_saves_and_says_how_to_continue(click: list[str], tmp_path: Path,
     run, said_out, said_err = (tmp_path / name for name in ("run", "out", "err"))
     steps = ["--steps=1000000", f"--output_dir={run}"]
     process = processes.start("cqn-train", *TINY_RUN, *click, *steps, out=str(said_out), err=str(said_err))
-    # The last table to be made is that of the evaluations.
-    wait_until(lambda: (run / "evaluations.csv").exists() and len(tables(run)["episodes"]) >= 2)
+    # The last table to be made is that of the diagnosis.
+    wait_until(lambda: (run / "diagnosis.csv").exists() and len(tables(run)["episodes"]) >= 2)
     os.kill(process, signal.SIGINT)
     code = os.waitstatus_to_exitcode(processes.wait(process))
     out, err = said_out.read_text(), said_err.read_text()

@@ -117,7 +117,7 @@ def test_an_arm_that_hears_nothing_of_its_learner_says_so(monkeypatch: pytest.Mo
     """And no longer once it hears of it again."""
     said: list[str] = []
     here = SimpleNamespace(learning=said.append, take_corrected=dict)
-    arm = Collector(0, {}, (), str(tmp_path))
+    arm = Collector(0, {}, (), str(Path.cwd()), str(tmp_path))
     arm._here = here  # type: ignore[assignment]
     now = [100.0]
     monkeypatch.setattr(collector.time, "monotonic", lambda: now[0])

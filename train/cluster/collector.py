@@ -111,9 +111,15 @@ class NewbornError(CQNError):
 class Collector:
     """Acts in an environment of its own. Calls come one after another, those of `talk` beside them."""
 
-    def __init__(self, index: int, config: Mapping[str, Any], plugins: Sequence[str], spool: str | None = None) -> None:
-        """Nothing is made yet. config: the run's, encoded; plugins: arguments that name packages to load first."""
-        self.index, self._encoded, self._plugins = index, config, plugins
+    def __init__(
+        self, index: int, config: Mapping[str, Any], plugins: Sequence[str], folder: str, spool: str | None = None
+    ) -> None:
+        """Nothing is made yet.
+
+        config: the run's, encoded; plugins: arguments that name packages to load first; folder: that the command was
+        given in, which paths of plugins begin at where this machine has it.
+        """
+        self.index, self._encoded, self._plugins, self._folder = index, config, plugins, folder
         self._spool = Spool(Path(spool) if spool else _cache())
         self._stack = contextlib.ExitStack()
         self._stopping = False
@@ -134,6 +140,8 @@ class Collector:
     def describe(self) -> Description:
         """Make the environment, and say where it is. Raises CQNError in one line."""
         if self._config is None:
+            if Path(self._folder).is_dir():
+                os.chdir(self._folder)
             register_third_party_plugins()
             register_devices()
             with_plugins(list(self._plugins))

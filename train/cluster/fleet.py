@@ -26,6 +26,8 @@ __all__ = ["Fleet"]
 
 PULSE_S = 1.0
 WAIT_S = 0.2  # for an answer, before signals are looked at
+CLOSES_WITHIN_S = 5.0
+STALLED_S = 30.0  # without a sign of life after which a collector counts as lost
 RETRY_S = 3.0  # before a collector that was lost is asked again
 
 
@@ -41,6 +43,7 @@ class _Seat:
     promise: Any = None
     asked: str = ""
     pulse: Any = None
+    pulsed: float = 0.0  # when it was asked for that sign of life
     retry_at: float = 0.0
     fit: Fit | None = None
     host: str = ""
@@ -227,7 +230,10 @@ class Fleet:
 
     def close(self) -> None:
         """Tell the collectors what is stored: they keep nothing that is not needed."""
-        self._tell_stored()
+        told, deadline = self._tell_stored(), time.monotonic() + CLOSES_WITHIN_S
+        while told and time.monotonic() < deadline:
+            heard = [id(promise) for promise in self.calls.answered(told, WAIT_S)]
+            told = [promise for promise in told if id(promise) not in heard]
 
     # -- turns and weights -----------------------------------------------------------------------------------
 
@@ -274,7 +280,7 @@ class Fleet:
             try:
                 answer = self.calls.answer(promise)
             except (Gone, NewbornError) as error:
-                self._lose(seat, error)
+                self._lose(seat, str(error))
                 continue
             except CQNError as error:
                 if self._opened and seat.fit is None:  # a late one that does not fit: the others go on
@@ -333,11 +339,11 @@ class Fleet:
             self._keys.add(finished.turn.key)
             self._over.append(finished)
 
-    def _lose(self, seat: _Seat, error: Exception) -> None:
+    def _lose(self, seat: _Seat, why: str) -> None:
         if seat.state == "evaluating":
             self._missing.append(seat.part)
         if seat.state != "lost":
-            self.say(f"Collector {seat.index} is lost ({error}): the run goes on with the others, and asks again.")
+            self.say(f"Collector {seat.index} is lost ({why}): the run goes on with the others, and asks again.")
         seat.state, seat.fit, seat.retry_at = "lost", None, time.monotonic() + RETRY_S
 
     # -- signs of life ---------------------------------------------------------------------------------------
@@ -356,8 +362,13 @@ class Fleet:
                 for number, label in pulse.corrected.items():
                     if self._applied.get(number) is not label:
                         self._applied[number] = self._corrected[number] = label
-            if seat.pulse is None and seat.fit is not None and seat.state not in ("lost", "left"):
-                seat.pulse = self.calls.call(seat.index, "pulse", self._doing)
+            if seat.fit is None or seat.state in ("lost", "left"):
+                continue
+            if seat.pulse is None:
+                seat.pulse, seat.pulsed = self.calls.call(seat.index, "pulse", self._doing), time.monotonic()
+            elif time.monotonic() - seat.pulsed > STALLED_S:
+                seat.promise = seat.pulse = None  # what it is at comes from its disk, should it go on
+                self._lose(seat, f"no sign of life for {STALLED_S:.0f} s")
         self._tell_stored()
         self.on_seats([
             {"collector": s.index, "host": s.host, "state": s.doing if s.state in ("idle", "acting") and s.doing
@@ -365,11 +376,10 @@ class Fleet:
             for s in self.seats
         ])  # fmt: skip
 
-    def _tell_stored(self) -> None:
+    def _tell_stored(self) -> list[Any]:
         keys, self._kept = self._kept, []
-        for seat in self.seats if keys else ():
-            if seat.fit is not None and seat.state not in ("lost", "left"):
-                self.calls.call(seat.index, "stored", keys)
+        there = [seat for seat in self.seats if seat.fit is not None and seat.state not in ("lost", "left")]
+        return [self.calls.call(seat.index, "stored", keys) for seat in (there if keys else ())]
 
     def _stop(self) -> None:
         """Ask all to stop; what they were at is dropped, what was over is kept on their disks."""

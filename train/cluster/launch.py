@@ -42,7 +42,7 @@ def launch(valid: ValidRun, arguments: Sequence[str], monitor: Monitor, should_s
         one = {settings.robot_resource: 1} if settings.robot_resource else {}
         actor = ray.remote(concurrency_groups={"talk": 4})(_grouped(ray, Collector, ("pulse", "stored", "stop")))
         collectors = [
-            actor.options(num_cpus=1, resources=one, max_restarts=-1).remote(index, config, plugins)
+            actor.options(num_cpus=1, resources=one, max_restarts=-1).remote(index, config, plugins, os.getcwd())
             for index, config in enumerate(configs)
         ]
         with _overview(valid, monitor) as (shown, note):
@@ -111,7 +111,7 @@ def _with_learner(
     died = 0
     while True:
         begun = _checkpoint_time(valid)
-        learner = actor.remote(arguments, calls, threads)
+        learner = actor.remote(arguments, calls, threads, os.getcwd())
         ended = _watch(ray, learner, monitor, note, should_stop)
         if ended is not None:
             if ended.error:

@@ -1,6 +1,7 @@
 """The learner: the process that trains (a Ray actor's class), with collectors elsewhere as its source of episodes."""
 
 import contextlib
+import os
 import secrets
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -48,9 +49,12 @@ class Shown:
 class Learner:
     """A run; `look` and `stop` may be called beside `run`."""
 
-    def __init__(self, arguments: Sequence[str], calls: Calls, threads: int) -> None:
-        """Nothing is made yet. arguments: of cqn-train; threads: of torch, where they do not say how many."""
-        self._arguments, self._calls, self._threads = list(arguments), calls, threads
+    def __init__(self, arguments: Sequence[str], calls: Calls, threads: int, folder: str) -> None:
+        """Nothing is made yet.
+
+        arguments: of cqn-train; threads: of torch, where they do not say how many; folder: that paths in them begin at.
+        """
+        self._arguments, self._calls, self._threads, self._folder = list(arguments), calls, threads, folder
         self._told: list[tuple[str, tuple[Any, ...]]] = []
         self._seats: Sequence[Mapping[str, Any]] = ()
         self._lock = threading.Lock()
@@ -58,6 +62,7 @@ class Learner:
 
     def run(self) -> Ended:
         """Train; what a person could mend becomes one line."""
+        os.chdir(self._folder)
         register_third_party_plugins()
         torch.set_num_threads(self._threads)
         try:
