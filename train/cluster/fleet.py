@@ -335,9 +335,12 @@ class Fleet:
 
     def _bring_in(self, finished: Finished) -> None:
         """Hand an episode on, once: it may come by itself and again from the disk of its collector."""
-        if finished.turn.key not in self._keys:
-            self._keys.add(finished.turn.key)
+        key = finished.turn.key
+        if key not in self._keys:
+            self._keys.add(key)
             self._over.append(finished)
+        elif key not in [one.turn.key for one in self._over]:  # stored, and its collector did not hear of it
+            self._kept.append(key)
 
     def _lose(self, seat: _Seat, why: str) -> None:
         if seat.state == "evaluating":
