@@ -1,5 +1,6 @@
 """The learner's side of the collectors: hands out turns and weights, takes in episodes, and keeps the ratio of both."""
 
+import math
 import secrets
 import time
 from collections import deque
@@ -26,6 +27,7 @@ __all__ = ["Fleet"]
 
 PULSE_S = 1.0
 WAIT_S = 0.2  # for an answer, before signals are looked at
+WAITS_S = 15.0  # for a first collector before a line says so
 CLOSES_WITHIN_S = 5.0
 STALLED_S = 30.0  # without a sign of life after which a collector counts as lost
 RETRY_S = 3.0  # before a collector that was lost is asked again
@@ -106,15 +108,18 @@ class Fleet:
         """
         for seat in self.seats:
             self._ask(seat, "describe")
-        first: float | None = None
-        while first is None or (len(self._described) < self.count and time.monotonic() - first < RETRY_S):
+        began, first = time.monotonic(), math.inf
+        while not self._described or (len(self._described) < self.count and time.monotonic() - first < RETRY_S):
             self._look(WAIT_S)
-            if self._described and first is None:
-                first = time.monotonic()
+            if self._described:
+                first = min(first, time.monotonic())
+            elif time.monotonic() - began > WAITS_S:
+                began = math.inf
+                self.say("No collector yet: they wait for a free processor, or their resource, on the cluster.")
             if self.should_stop():
                 raise Interrupted
             if all(seat.state == "lost" for seat in self.seats):
-                raise ConfigError("No collector could be started: see Ray's logs, or give --debug.")
+                raise ConfigError("No collector could be started: see Ray's logs in /tmp/ray/session_latest/logs.")
         if len(self._described) < self.count:
             self.say(f"{len(self._described)} of {self.count} collectors are there: the others may join later.")
         return self._described[min(self._described)]

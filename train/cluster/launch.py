@@ -120,7 +120,10 @@ def _with_learner(
         now = _checkpoint_time(valid)
         died = died + 1 if now == begun else 0
         if now is None or died >= TRIES or should_stop():
-            raise CQNError("The learner's process died: see Ray's logs; a checkpoint goes on with --resume=true.")
+            raise CQNError(
+                "The learner's process died (Ray's logs: /tmp/ray/session_latest/logs): --resume=true goes on from its "
+                "last checkpoint, where there is one."
+            )
         monitor.message("The learner's process died: another one goes on from the last checkpoint.")
         arguments = ["--resume=true", f"--output_dir={valid.output_dir}"]
 

@@ -1,6 +1,7 @@
 """The learner: the process that trains (a Ray actor's class), with collectors elsewhere as its source of episodes."""
 
 import contextlib
+import logging
 import os
 import secrets
 import threading
@@ -65,11 +66,15 @@ class Learner:
         os.chdir(self._folder)
         register_third_party_plugins()
         torch.set_num_threads(self._threads)
+        ours, notices = logging.getLogger(__package__.partition(".")[0]), _Notices(self.message)
+        ours.addHandler(notices)
         try:
             valid = parse(self._arguments).validate()
             return Ended(code=execute(valid, self, lambda: self._stopping, self._world))
         except (CQNError, OSError) as error:
             return Ended(code=2 if isinstance(error, CQNError) else 1, error=" ".join(str(error).split()))
+        finally:
+            ours.removeHandler(notices)
 
     def _world(
         self,
@@ -129,6 +134,17 @@ class Learner:
     def stop(self) -> None:
         """Save and end at the next safe point."""
         self._stopping = True
+
+
+class _Notices(logging.Handler):
+    """Passes on what the code says through its logger: nobody sees this process's own stderr."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        super().__init__()
+        self._say = say
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._say(record.getMessage())
 
 
 def run_id(output_dir: Path) -> str:
