@@ -78,7 +78,7 @@ def test_killed_processes_cost_no_finished_episode(
         "cqn-train", *TINY_RUN, *click, *options, f"--output_dir={run}", out=str(out), err=str(out)
     )
     try:
-        wait_until(more_than(3), 60)
+        wait_until(more_than(3), 180)
         listening = [one for one in psutil.net_connections("inet") if one.status == psutil.CONN_LISTEN]
         ours = {one.pid for one in descendants(process)}
         addresses = {one.laddr.ip.removeprefix("::ffff:") for one in listening if one.pid in ours}
@@ -86,9 +86,9 @@ def test_killed_processes_cost_no_finished_episode(
         for begin in ("ray::Collector", "ray::Learner"):
             kill_one(process, begin)
             if begin == "ray::Collector":
-                wait_until(lambda: "is lost" in out.read_text(), 60)
+                wait_until(lambda: "is lost" in out.read_text(), 120)
             before = len(stored(run))
-            wait_until(more_than(before + 6), 60)
+            wait_until(more_than(before + 6), 180)
         rays = [*descendants(process, "ray::Collector"), *descendants(process, "ray::Learner")]
         assert len(rays) >= 2  # a collector may still be on its way back
     finally:

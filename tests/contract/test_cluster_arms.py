@@ -2,6 +2,7 @@
 
 import json
 import socket
+import time
 import urllib.request
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,7 @@ def test_two_arms_practise_one_policy(
     )  # fmt: skip
 
     def arms() -> list[dict[str, Any]]:
+        time.sleep(0.2)  # the processor is for the arms
         try:
             found: list[dict[str, Any]] = ask(port, "/api/state")["arms"]
         except OSError:
@@ -72,7 +74,7 @@ def test_two_arms_practise_one_policy(
         return found
 
     try:
-        wait_until(lambda: len(arms()) == 2 and all(arm["episodes"] >= 1 for arm in arms()), 120)
+        wait_until(lambda: len(arms()) == 2 and all(arm["episodes"] >= 1 for arm in arms()), 240)
         seen = arms()
         assert [arm["page"].startswith(f"http://127.0.0.1:{port + 1 + i}/") for i, arm in enumerate(seen)] == [True] * 2
         # A person changes their mind on the page of the arm that had the first episode.
@@ -82,7 +84,7 @@ def test_two_arms_practise_one_policy(
                 ask(port + 1 + number, "/api/control", {})
                 ask(port + 1 + number, "/api/correct", {"episode": 0, "label": "success"})
     finally:
-        code = processes.wait(process, 200)
+        code = processes.wait(process, 300)
     assert code == 0, out.read_text()
     keys = stored(run)
     assert len({*keys}) == len({row["episode"] for row in tables(run)["episodes"]})
