@@ -26,7 +26,7 @@ from lerobot_cqn.settings import CQNASSettings
 from .agent import Agent
 from .arm.build import make_operated, recall, steering
 from .clock import REAL, Clock
-from .config import ValidRun
+from .config import EvalSettings, ValidRun
 from .interfaces import Monitor, Scenes
 from .loop.experience import Experience, Here
 from .loop.gym_env import GymEnvironment, GymScenes, OneScene, check_fits
@@ -43,7 +43,7 @@ from .run.first_look import draw_batch, warnings_about
 from .run.metrics import Log, Metrics, start_tensorboard, start_wandb
 from .run.progress import Monitors
 
-__all__ = ["MakeWorld", "World", "build", "make_agent", "trained_agent"]
+__all__ = ["MakeWorld", "World", "build", "make_agent", "make_scenes", "trained_agent"]
 
 Bounds = Mapping[str, Any]
 MakeWorld = Callable[
@@ -165,13 +165,20 @@ def make_simulation(
     bounds = gym.action_bounds()
     agent = make_agent(run, checkpoint, data, bounds)
     check_fits(env_config, agent.policy, "policy" if run.config.continues else "dataset")
-    scenes: Scenes = OneScene(gym)
-    if evaluation.batch_size > 1:
-        scenes = GymScenes(env_config, run.policy, evaluation.batch_size, apart=evaluation.use_async_envs)
     stack.callback(gym.close)
-    stack.callback(scenes.close)
-    here = Here.alone(gym, scenes, run.config.recipe.random_steps)
+    here = Here.alone(gym, make_scenes(env_config, run.policy, gym, evaluation, stack), run.config.recipe.random_steps)
     return World(agent=agent, experience=here, bounds=bounds)
+
+
+def make_scenes(
+    env_config: EnvConfig, policy: RLConfig, gym: GymEnvironment, settings: EvalSettings, stack: contextlib.ExitStack
+) -> Scenes:
+    """Scenes of evaluations: the training environment, or several beside it that step together."""
+    if settings.batch_size == 1:
+        return OneScene(gym)
+    several = GymScenes(env_config, policy, settings.batch_size, apart=settings.use_async_envs)
+    stack.callback(several.close)
+    return several
 
 
 def make_arm(

@@ -21,18 +21,20 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from numpy.typing import NDArray
 
 from cqn_data.terminal.options import with_plugins
+from lerobot_cqn.base_config import RLConfig
 from lerobot_cqn.errors import CQNError
 
 from .. import envs  # noqa: F401  # registers our environments
 from ..agent import Agent
 from ..arm.build import Operated, make_operated, steering
 from ..arm.devices import register_devices
+from ..build import make_scenes
 from ..config import RunConfig
 from ..interfaces import Interrupted, Label
 from ..loop.acting import Acting, Finished, Turn
 from ..loop.evaluate import Evaluation
 from ..loop.experience import Here
-from ..loop.gym_env import GymEnvironment, GymScenes, OneScene
+from ..loop.gym_env import GymEnvironment, OneScene
 from ..replay.demonstrations import Recorded
 from ..run.checkpoint import seed_everything
 from .parcel import Files, Weights, take_weights, unpack
@@ -182,13 +184,9 @@ class Collector:
 
     def _make(self, config: RunConfig, agent: Agent, recorded: Recorded | None) -> Here:
         if self._gym is not None:
-            assert config.env is not None and config.policy is not None  # noqa: S101, PT018
-            count, scenes = config.eval.batch_size, OneScene(self._gym)
-            if count == 1:
-                return Here.alone(self._gym, scenes, config.recipe.random_steps)
-            several = GymScenes(config.env, config.policy, count, apart=config.eval.use_async_envs)
-            self._stack.callback(several.close)
-            return Here.alone(self._gym, several, config.recipe.random_steps)
+            assert config.env is not None and isinstance(config.policy, RLConfig)  # noqa: S101, PT018
+            scenes = make_scenes(config.env, config.policy, self._gym, config.eval, self._stack)
+            return Here.alone(self._gym, scenes, config.recipe.random_steps)
         assert config.robot is not None  # noqa: S101  # one of the two is there
         operated = make_operated(config.robot, config, agent, recorded, lambda: self._stopping, self._say)
         self._stack.enter_context(steering(config, operated, self._say))

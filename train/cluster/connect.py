@@ -133,8 +133,8 @@ def _is_loopback(address: str) -> bool:
     return False
 
 
-def check_resource(ray: Any, name: str, wanted: int, option: str) -> int:
-    """How many of `wanted` pieces of a resource the cluster has now. Raises ConfigError where there is none."""
+def check_resource(ray: Any, name: str, option: str) -> None:
+    """Make sure that some node of the cluster has a resource. Raises ConfigError where none does."""
     have = {key: value for key, value in ray.cluster_resources().items() if not key.startswith("node:")}
     if not have.get(name):
         others = ", ".join(sorted(key for key in have if "memory" not in key)) or "none"
@@ -142,7 +142,6 @@ def check_resource(ray: Any, name: str, wanted: int, option: str) -> int:
             f"{option}={name}: no node of the cluster has it (there are: {others}). Start Ray on the computer with the "
             f"arm by `ray start --address=… --resources='{{\"{name}\": 1}}'`."
         )
-    return min(wanted, int(have[name]))
 
 
 class RayCalls:

@@ -38,7 +38,7 @@ def launch(valid: ValidRun, arguments: Sequence[str], monitor: Monitor, should_s
     monitor.message("Starting Ray …" if settings.address is None else f"Joining Ray at {settings.address} …")
     with connected(settings, settings.actors + 1) as ray:
         if settings.robot_resource:
-            check_resource(ray, settings.robot_resource, settings.actors, "--ray.robot_resource")
+            check_resource(ray, settings.robot_resource, "--ray.robot_resource")
         one = {settings.robot_resource: 1} if settings.robot_resource else {}
         actor = ray.remote(concurrency_groups={"talk": 4})(_grouped(ray, Collector, ("pulse", "stored", "stop")))
         collectors = [

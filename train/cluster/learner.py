@@ -23,12 +23,11 @@ from ..config import ValidRun
 from ..execute import execute
 from ..loop.gym_env import check_fits
 from ..replay.demonstrations import Demonstrations
+from ..run.beginning import RUN_ID
 from .calls import Calls
 from .fleet import Fleet
 
-__all__ = ["RUN_ID", "Ended", "Learner", "Shown"]
-
-RUN_ID = "run_id"  # file in the run's folder: which episodes of a collector's disk are its own
+__all__ = ["Ended", "Learner", "Shown"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,9 +11,10 @@ from lerobot_cqn.errors import OutputExistsError
 
 from .metrics import COLUMNS
 
-__all__ = ["BEGUN", "PAGE", "beginning", "forget_beginning"]
+__all__ = ["BEGUN", "PAGE", "RUN_ID", "beginning", "forget_beginning"]
 
 BEGUN = ".begun"  # in the run's folder, locked by the process that begins it
+RUN_ID = "run_id"  # of a run with collectors: which of the episodes on their disks are its own
 PAGE = "page"  # certificate and address of the operator's page, made before anything else
 MADE = (
     "replay",
@@ -21,7 +22,7 @@ MADE = (
     PAGE,
     "tensorboard",
     "first_batch.png",
-    "run_id",
+    RUN_ID,
     *(f"{table}.csv" for table in COLUMNS),
     BEGUN,
 )
